@@ -123,11 +123,11 @@ class ServedController:
         if self.mute:
             return
 
-        def say(handle: Any) -> Any:
+        def finish(handle: Any) -> Any:
             getattr(handle, how)()
             return self._kind.Result(error_code=code, error_string=text)
 
-        self._server.finish(handle, say)
+        self._server.finish(handle, finish)
 
     def step(self, now: float) -> None:
         """What it does in a cycle."""

@@ -113,7 +113,7 @@ MACHINES: Mapping[str, tuple[Callable[[Path], Plant], bool]] = {
 }
 
 
-def unseen(make: Callable[[], Plant], is_linear: bool, say: Callable[[str], None]) -> dict[str, float]:
+def unseen(make: Callable[[], Plant], is_linear: bool, log: Callable[[str], None]) -> dict[str, float]:
     """Of each way the rms error over all readings, each predicted without its fold."""
     plant = make()
     tables = [np.asarray(t, dtype=np.float64) for t in plant.measured()]
@@ -133,7 +133,7 @@ def unseen(make: Callable[[], Plant], is_linear: bool, say: Callable[[str], None
         for name, rest in answers.items():
             out.setdefault(name, np.full(len(y), np.nan))[hidden] = rest[hidden]
         words = ', '.join(f'{name} {rms(rest[hidden & np.isfinite(y)]):.4g}' for name, rest in answers.items())
-        say(f'fold {fold:.0f}: {words}')
+        log(f'fold {fold:.0f}: {words}')
     return {name: rms(rest[np.isfinite(rest)]) for name, rest in out.items()}
 
 

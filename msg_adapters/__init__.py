@@ -142,14 +142,14 @@ def _of_psd(psd: int) -> Callable[[str, SpotMeans], Iterator[Item]]:
 class Topic(NamedTuple):
     """One topic, or one for each solver (``{solver}``): the message on it and the record that it is made of.
 
-    ``says``: what is on it, for the documentation. ``fields``: of a record, or of what ``items`` makes
+    ``description``: what is on it, for the documentation. ``fields``: of a record, or of what ``items`` makes
     of it. ``to_record``: back again, for a topic that the node subscribes to. ``delivery``: how it is
     published, or subscribed to if it is an input. ``items``: the messages of a record. ``common``: has
     one name for all nodes of a graph, whatever their namespaces.
     """
 
     name: str
-    says: str
+    description: str
     message: MessageType
     record: type[Any]
     fields: Callable[[Any], Fields]

@@ -32,7 +32,9 @@ _CHANNEL = re.compile(r'_(?:x|y|sum)\d$')
 def topics() -> str:
     """A row for each topic, or for those of several PSDs or solvers, and one for each action."""
     heard = (rows[0] for rows in HEARD.values())
-    actions = [f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.says} |' for a in SERVED.values()]
+    actions = [
+        f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.description} |' for a in SERVED.values()
+    ]
     return _table('topic | type | node | QoS | ', [*_rows(PUBLISHED.values(), ''), *_rows(heard, ' (in)'), *actions])
 
 
@@ -84,7 +86,7 @@ def _rows(rows: Iterable[GraphTopic], direction: str) -> Iterator[str]:
         names = ', '.join(f'`{row.name}`' for row in group[:2]) + (' …' if len(group) > 2 else '')
         row = group[0]
         kind = row.type.split('/')[-1] or 'any'
-        yield f'| {names}{direction} | {kind} | {row.node} | {_qos(row.delivery)} | {row.says} |'
+        yield f'| {names}{direction} | {kind} | {row.node} | {_qos(row.delivery)} | {row.description} |'
 
 
 def _qos(delivery: Delivery) -> str:

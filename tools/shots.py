@@ -74,14 +74,14 @@ def loaded(driver: Any) -> bool:
     return re.fullmatch(LOADED, driver.execute_script(THETA)) is not None
 
 
-def says(*texts: str) -> Callable[[Any], bool]:
+def shows(*texts: str) -> Callable[[Any], bool]:
     """Whether the page shows one of ``texts``."""
     return lambda driver: any(text in driver.execute_script('return document.body.innerText') for text in texts)
 
 
 def away_without(device: Program) -> Callable[[Any], bool]:
     """Pull the cable at the first question; then whether the page says so."""
-    away = says('no samples')
+    away = shows('no samples')
 
     def ready(driver: Any) -> bool:
         device.end()
@@ -206,7 +206,7 @@ def main() -> int:
             program.end()
         program = Program([*monitor, 'bags/laser_off', '--loop'], FIGURES.parents[1])
         try:
-            take(program.until(r'monitor: (http\S+)')[1], *LASER_OFF, 1.0, says('laser 1 lost', 'laser 2 lost'))
+            take(program.until(r'monitor: (http\S+)')[1], *LASER_OFF, 1.0, shows('laser 1 lost', 'laser 2 lost'))
         finally:
             program.end()
         port = f'{folder}/rig_port'

@@ -23,10 +23,10 @@ class LogCallback(Protocol):
 def texts(take: Callable[[str], object]) -> LogCallback:
     """What says a line by giving its text alone to ``take``."""
 
-    def say(text: str, level: int = INFO, /) -> None:
+    def log(text: str, level: int = INFO, /) -> None:
         take(text)
 
-    return say
+    return log
 
 
 def null_log(text: str, level: int = INFO, /) -> None:

@@ -57,14 +57,14 @@ class GraphTopic(NamedTuple):
 
     ``name``: as of our own rig, ``/link_tip/deflection``; it becomes relative to the node's
     namespace, unless it is ``common`` to all nodes of a graph. ``type``: ``pkg/msg/Name``, or ''
-    where a parameter names it. ``node``: the executable. ``says``: what is on it. ``overridable``:
+    where a parameter names it. ``node``: the executable. ``description``: what is on it. ``overridable``:
     by ``qos_overrides`` parameters. ``most_bytes``: maximum size of a message that is heard.
     """
 
     name: str
     type: str
     node: str
-    says: str
+    description: str
     delivery: Delivery = RELIABLE
     common: bool = False
     overridable: bool = True
@@ -74,13 +74,13 @@ class GraphTopic(NamedTuple):
 class GraphAction(NamedTuple):
     """An action that a node serves.
 
-    ``name``, ``node``, ``says``, ``most_bytes``: as of a topic. ``type``: ``pkg/action/Name``.
+    ``name``, ``node``, ``description``, ``most_bytes``: as of a topic. ``type``: ``pkg/action/Name``.
     """
 
     name: str
     type: str
     node: str
-    says: str
+    description: str
     most_bytes: int = MOST_BYTES
 
 
@@ -114,7 +114,7 @@ def _record_topic(topic: Topic, node: str = _ESTIMATOR) -> GraphTopic:
         topic.name,
         topic.message.name,
         _EVERY if topic.common else node,
-        topic.says,
+        topic.description,
         topic.delivery,
         topic.common,
         most_bytes=MOST_RECORDED_BYTES,

@@ -213,7 +213,7 @@ def test_an_unplugged_one_comes_back(wired: Any, run: Any, unloaded: Any) -> Non
     assert running.acquisition.counters.disconnects == 1
 
 
-class Says:
+class Sends:
     """Sends the same bytes whenever its port is opened, and nothing else."""
 
     def __init__(self, text: bytes) -> None:
@@ -241,13 +241,13 @@ class Says:
     ],
 )
 def test_another_device_is_rejected_by_name(wired: Any, text: bytes, message: str) -> None:
-    port = wired(Says(text))
+    port = wired(Sends(text))
     with pytest.raises(DeviceError, match=message):
         make_source(load_rig(overrides={'source': 'lines', 'port': str(port.link)})).open(2.0)
 
 
 def test_counts_of_24_bits(wired: Any) -> None:
-    device = Says(b'\n#{"sample_rate_hz": 1000, "volts_per_count": %r}\n' % (10.0 / 2**23))
+    device = Sends(b'\n#{"sample_rate_hz": 1000, "volts_per_count": %r}\n' % (10.0 / 2**23))
     device.take = lambda since_power_up_ns, room=4096: b'1,1000,8388607,-8388608,4000000,0,1,5\n'  # type: ignore[method-assign]
     rig = load_rig(overrides={'source': 'lines', 'port': str(wired(device).link), 'converter.bits': 24})
     source = make_source(rig)
@@ -267,7 +267,7 @@ def test_counts_of_24_bits(wired: Any) -> None:
     ],
 )
 def test_readings_out_of_bounds_are_no_samples(wired: Any, info: bytes, line: bytes, reason: str) -> None:
-    device = Says(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
+    device = Sends(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
     device.take = lambda since_power_up_ns, room=4096: line + b'\n'  # type: ignore[method-assign]
     source = make_source(load_rig(overrides={'source': 'lines', 'port': str(wired(device).link)}))
     source.open(2.0)
@@ -286,7 +286,7 @@ def test_a_thousand_volts_are_the_most(wired: Any) -> None:
 
 def sent(wired: Any, info: bytes, line: bytes, **more: Any) -> Any:
     """What the source makes of a line."""
-    device = Says(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
+    device = Sends(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
     device.take = lambda since_power_up_ns, room=4096: line + b'\n'  # type: ignore[method-assign]
     source = make_source(load_rig(overrides={'source': 'lines', 'port': str(wired(device).link), **more}))
     hello = source.open(2.0)

@@ -74,7 +74,7 @@ def test_a_topic_without_a_row_is_rejected() -> None:
 
 def test_every_row_says_what_is_on_it() -> None:
     rows = [*PUBLISHED.values(), *(row for rows in HEARD.values() for row in rows)]
-    assert [row.name for row in rows if not (row.says and row.node)] == []
-    assert [row.name for row in SERVED.values() if not (row.says and row.node and row.type)] == []
+    assert [row.name for row in rows if not (row.description and row.node)] == []
+    assert [row.name for row in SERVED.values() if not (row.description and row.node and row.type)] == []
     # Any type there may be is named by a parameter, and that is one.
     assert [row.name for row in rows if not row.type] == ['~/controller_state']

@@ -101,19 +101,19 @@ def test_rejected_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch)
 
 def test_lines_about_estimates_come_once_a_second_with_counts() -> None:
     logged: list[str] = []
-    spokesman = OutageLog(texts(logged.append))
+    outages = OutageLog(texts(logged.append))
     # Fifty blocks a second, every other one without an estimate, for ten seconds.
     for i in range(500):
         lost = i % 2 == 1
-        spokesman.block('LASER_LOST' if lost else '', 'no estimate: laser 1 lost' if lost else '', 10.0 + 0.02 * i)
+        outages.block('LASER_LOST' if lost else '', 'no estimate: laser 1 lost' if lost else '', 10.0 + 0.02 * i)
     assert 9 <= len(logged) <= 11
     assert logged[0] == 'no estimate: laser 1 lost'
     assert '25 blocks affected' in logged[1] or '26 blocks affected' in logged[1]
     # And nothing while nothing changes.
     before = len(logged)
     for i in range(500):
-        spokesman.block('', '', 30.0 + 0.02 * i)
+        outages.block('', '', 30.0 + 0.02 * i)
     assert len(logged) <= before + 1
-    spokesman.block('SATURATED', 'no estimate: x1 saturated', 50.0)
-    spokesman.block('', '', 52.0)
+    outages.block('SATURATED', 'no estimate: x1 saturated', 50.0)
+    outages.block('', '', 52.0)
     assert logged[-2:] == ['no estimate: x1 saturated', 'estimates are back']

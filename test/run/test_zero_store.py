@@ -118,9 +118,9 @@ def test_a_zero_that_cannot_be_kept_in_the_background_is_reported(tmp_path: Path
     store = ZeroStore(rig, 'A')
     logged: list[tuple[str, int]] = []
 
-    def say(text: str, level: int = INFO, /) -> None:
+    def log(text: str, level: int = INFO, /) -> None:
         logged.append((text, level))
 
-    store.keep(rig, say)
+    store.keep(rig, log)
     assert store.join(WAIT_S)
     assert logged == [(store.save(rig), ERROR)]

@@ -124,11 +124,11 @@ class LiveDisplay:
         else:
             self._notify(step.progress)
 
-    def _once(self, words: str, say: Callable[[str], None]) -> None:
+    def _once(self, words: str, log: Callable[[str], None]) -> None:
         if words not in self._logged:
             self._logged.add(words)
             self.end()
-            say(words)
+            log(words)
 
     def _notify(self, progress: CalibrationProgress) -> None:
         for parameter in progress.parameters:

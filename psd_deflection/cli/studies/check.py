@@ -97,7 +97,7 @@ def _guided(args: argparse.Namespace) -> Checkup:
     if rig.acquisition.port:
         reject(args, {'world': []}, 'is for the simulated rig: give no --port')
     shown = GuideDisplay(quiet=args.json)
-    found = run_guided(rig, in_the_world(rig, args.world), texts(shown.say), shown.update)
+    found = run_guided(rig, in_the_world(rig, args.world), texts(shown.log), shown.update)
     shown.end()
     return found
 
@@ -110,7 +110,7 @@ class GuideDisplay:
         self._live = self._stream.isatty()
         self._turn = 0
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """A prompt or a message."""
         clear = '\r\x1b[K' if self._live else ''
         print(f'{clear}{sanitize(text, LONGEST_LINE)}', file=self._stream, flush=True)

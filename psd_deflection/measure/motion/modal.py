@@ -80,7 +80,7 @@ class Oscillator:
         return self.by.einsum('np,npci,npcj->ncij', parts, pushed, pushed)
 
 
-class Says(NamedTuple):
+class BlockGains(NamedTuple):
     """What n samples of a block say; A axes, K rates. S: their covariance if x0 is known, X: that of x_end with them.
 
     ``observed`` (A, n, 4): O. ``precision`` (A, K, n, n): S^-1. ``pulled`` (A, K, 4, n): O^T S^-1. ``smoothed``
@@ -138,11 +138,11 @@ class BlockTables:
         self.added = self._by.einsum('akc,acij->akij', rates, self._spread)
         self._whole = self._of(np.arange(self.size))
 
-    def says(self, slots: IntArray) -> Says:
+    def gains(self, slots: IntArray) -> BlockGains:
         """What the samples at ``slots`` (n,) of the block say. A whole block is at hand, others are computed."""
         return self._whole if len(slots) == self.size else self._of(slots)
 
-    def _of(self, slots: IntArray) -> Says:
+    def _of(self, slots: IntArray) -> BlockGains:
         covariance = self._covariance[:, :, slots[:, None], slots]
         count = len(slots)
         precision = inverse(covariance.reshape(-1, count, count)).reshape(covariance.shape)
@@ -151,7 +151,7 @@ class BlockTables:
         pulled = self._by.einsum('ani,aknm->akim', observed, precision)
         smoothed = self._by.einsum('akin,aknm->akim', reach, precision)
         size = self._by.log_det(covariance)
-        return Says(
+        return BlockGains(
             observed,
             precision,
             pulled,

@@ -283,8 +283,8 @@ class ModalFilter:
         pushed: Pushed | None,
         forced: Forced | None,
     ) -> None:
-        says = self._tables.says(slots)
-        foretold = self._by.einsum('ani,ai->an', says.observed, self._x)
+        gains = self._tables.gains(slots)
+        foretold = self._by.einsum('ani,ai->an', gains.observed, self._x)
         after = self._by.einsum('aij,aj->ai', self._tables.phi, self._x)
         p = self._p + self._unforeseen(self.coasted) if self.coasted > 0.0 else self._p
         if pushed is not None:
@@ -300,30 +300,30 @@ class ModalFilter:
         miss = poses.T - foretold
         levels = self.levels
         # Of x0, one sample before the block: what the block says, then with what was known.
-        scaled = self._by.einsum('aknm,am->akn', says.precision, miss)
-        score = self._by.einsum('akin,an->aki', says.pulled, miss)
+        scaled = self._by.einsum('aknm,am->akn', gains.precision, miss)
+        score = self._by.einsum('akin,an->aki', gains.pulled, miss)
         known = inverse(p)
-        posterior = inverse((known[:, None] + says.information).reshape(-1, 4, 4)).reshape(3, levels, 4, 4)
+        posterior = inverse((known[:, None] + gains.information).reshape(-1, 4, 4)).reshape(3, levels, 4, 4)
         squares = self._by.einsum('an,akn->ak', miss, scaled) - self._by.einsum(
             'aki,akij,akj->ak', score, posterior, score
         )
-        size = says.log_size - self._by.log_det_by_pivots(posterior) + self._by.log_det_by_pivots(p)[:, None]
+        size = gains.log_size - self._by.log_det_by_pivots(posterior) + self._by.log_det_by_pivots(p)[:, None]
         prior = self._by.einsum('ak,kl->al', self._weights, self._changes)
         log_weights = self._by.log_many(prior) - 0.5 * (size + squares)
         weights = self._by.exp_many(log_weights - log_weights.max(axis=1, keepdims=True))
         weights /= self._by.sum(weights, 1)[:, None]
-        carried = self._by.einsum('akij,akjl->akil', says.kept, posterior)
-        found = after[:, None] + self._by.einsum('akin,an->aki', says.smoothed, miss)
+        carried = self._by.einsum('akij,akjl->akil', gains.kept, posterior)
+        found = after[:, None] + self._by.einsum('akin,an->aki', gains.smoothed, miss)
         found += self._by.einsum('akij,akj->aki', carried, score)
-        covariance = self._by.einsum('akij,aklj->akil', carried, says.kept) + says.left
+        covariance = self._by.einsum('akij,aklj->akil', carried, gains.kept) + gains.left
         self._x = self._by.einsum('ak,aki->ai', weights, found)
         apart = found - self._x[:, None]
         spread = covariance + apart[..., :, None] * apart[..., None, :]
         self._p = self._by.einsum('ak,akij->aij', weights, spread)
         self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
-        mean = self._by.einsum('ak,akin->ain', weights, says.smoothed)
-        mean += self._by.einsum('akij,akjn->ain', weights[..., None, None] * carried, says.pulled)
-        own = self._tables.phi - self._by.einsum('ain,anj->aij', mean, says.observed)
+        mean = self._by.einsum('ak,akin->ain', weights, gains.smoothed)
+        mean += self._by.einsum('akij,akjn->ain', weights[..., None, None] * carried, gains.pulled)
+        own = self._tables.phi - self._by.einsum('ain,anj->aij', mean, gains.observed)
         noise = self._noise[:, slots[:, None], slots]
         both = self._by.einsum('pin,pnm->pim', mean[_FIRST], noise)
         self._shared = self._by.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])

@@ -29,7 +29,7 @@ from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.signatures import SignatureBank
-from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
+from psd_deflection.studies.discover.search.weighing import SIGNIFICANT, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.applied import wrong_load_findings
 from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS, SETUP
@@ -76,7 +76,7 @@ def law(problem: Problem) -> Problem:
     # Coarse steps cause noise that varies with the signal, which is no law.
     if rig_of(problem).recorded.lattice is not None:
         return problem
-    much = ws.gap(fit.difference) > UNSAID * ws.floor()
+    much = ws.gap(fit.difference) > SIGNIFICANT * ws.floor()
     if not (unknown_of(problem.residual, 1.0) or much or coincidences(fit, ws.physics)):
         return problem
     found_law = find_law(

@@ -21,7 +21,7 @@ from psd_deflection.studies.discover.search.free import LoadDirection
 from psd_deflection.studies.discover.search.signatures import (
     SignatureBank,
 )
-from psd_deflection.studies.discover.search.weighing import UNSAID
+from psd_deflection.studies.discover.search.weighing import SIGNIFICANT
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.applied import directions, levels, ringing_on, times, unseen
 from psd_deflection.studies.discover.setup.redundant import fourth_reading
@@ -110,7 +110,7 @@ def searched(problem: Problem) -> Problem:
     """
     problem = _searched(problem)
     ws, effects = workspace_of(problem.comparison), problem.result.fit.effects
-    if ws.gap(problem.fit.difference) < UNSAID * ws.floor():
+    if ws.gap(problem.fit.difference) < SIGNIFICANT * ws.floor():
         return problem
     ringing = [d for i, o in enumerate(ws.observations) for d in ringing_on(o, i, [*ws.base, *effects])]
     if not ringing:
@@ -125,7 +125,7 @@ def searched(problem: Problem) -> Problem:
     alternative = replace(problem, search=problem.search.at(free), fit=begun, null=refit(free, ()))
     for step in (partial(search, begun=begun), *SEARCH[1:]):
         alternative = step(alternative)
-    return alternative if alternative.comparison.gap(alternative.fit.difference) < UNSAID * ws.floor() else problem
+    return alternative if alternative.comparison.gap(alternative.fit.difference) < SIGNIFICANT * ws.floor() else problem
 
 
 def _searched(problem: Problem) -> Problem:
@@ -133,7 +133,7 @@ def _searched(problem: Problem) -> Problem:
     if machine.recorded.fourth is not None and machine.recorded.fourth.acquits and _follows_nothing(problem):
         # No detector is at fault, and nothing that is known: the loads are asked before the search spends on stand-ins.
         freed = _with_all_loads_free(problem)
-        if freed is not None and freed.comparison.gap(freed.fit.difference) < UNSAID * freed.comparison.floor():
+        if freed is not None and freed.comparison.gap(freed.fit.difference) < SIGNIFICANT * freed.comparison.floor():
             return _as_annotated(problem, freed)
     asked = _with_all_loads_free(problem, maybe_rounded=True) if _rounded_beside_effect(problem) else None
     if asked is not None and _rounded(asked):
@@ -214,7 +214,7 @@ def _rounded(problem: Problem) -> bool:
     rounded.
     """
     ws, free = workspace_of(problem.comparison), rig_of(problem).recorded.wrong
-    if ws.gap(problem.fit.difference) >= UNSAID * ws.floor():
+    if ws.gap(problem.fit.difference) >= SIGNIFICANT * ws.floor():
         return False
     observations = ws.observations
     free_of_recording = [[p for p in free if p.recording == i] for i in range(len(observations))]

@@ -36,7 +36,7 @@ from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
 from psd_deflection.studies.discover.search.smooth import Smooth, smooth_of
-from psd_deflection.studies.discover.search.weighing import UNSAID, sd_of
+from psd_deflection.studies.discover.search.weighing import SIGNIFICANT, sd_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, search, solve, weigh, where
 from psd_deflection.studies.study import PageSection
 
@@ -434,7 +434,7 @@ class SimulatedPlant(Machine):
 
     def smooth(self, comparison: Comparison, fit: Fit) -> Smooth | None:
         """Of the plant's variables, if more than its noise remains."""
-        if comparison.gap(fit.difference) <= UNSAID * comparison.floor():
+        if comparison.gap(fit.difference) <= SIGNIFICANT * comparison.floor():
             return None
         return smooth_of(comparison, fit, self.plant.variables())
 

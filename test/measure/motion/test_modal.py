@@ -75,20 +75,20 @@ def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> No
     tables = BlockTables((MODE,), 20, PERIOD)
     tables.fill(r * np.eye(20)[None], rates)
     here = [n for n in range(20) if n not in lost]
-    says = tables.says(np.array(here))
+    gains = tables.gains(np.array(here))
     x = np.array([1e-3, -2e-3, 5e-4, 1e-4])
     root = rng.normal(0.0, 1e-5, (4, 4))
     p = root @ root.T
     y = 1e-3 * rng.normal(1.0, 1e-2, 20)
     for k, rate in enumerate(rates[0]):
         expected = by_samples(y, here, x, p, rate, r)
-        miss = y[here] - says.observed[0] @ x
-        posterior = np.linalg.inv(np.linalg.inv(p) + says.information[0, k])
-        score = says.pulled[0, k] @ miss
-        found = says.kept[0, k] @ (x + posterior @ score) + says.smoothed[0, k] @ (miss + says.observed[0] @ x)
-        covariance = says.kept[0, k] @ posterior @ says.kept[0, k].T + says.left[0, k]
-        squares = miss @ says.precision[0, k] @ miss - score @ posterior @ score
-        size = says.log_size[0, k] + np.linalg.slogdet(p)[1] - np.linalg.slogdet(posterior)[1]
+        miss = y[here] - gains.observed[0] @ x
+        posterior = np.linalg.inv(np.linalg.inv(p) + gains.information[0, k])
+        score = gains.pulled[0, k] @ miss
+        found = gains.kept[0, k] @ (x + posterior @ score) + gains.smoothed[0, k] @ (miss + gains.observed[0] @ x)
+        covariance = gains.kept[0, k] @ posterior @ gains.kept[0, k].T + gains.left[0, k]
+        squares = miss @ gains.precision[0, k] @ miss - score @ posterior @ score
+        size = gains.log_size[0, k] + np.linalg.slogdet(p)[1] - np.linalg.slogdet(posterior)[1]
         np.testing.assert_allclose(found, expected[0], rtol=1e-7, atol=1e-12)
         np.testing.assert_allclose(covariance, expected[1], rtol=1e-5, atol=1e-18)
         assert squares == pytest.approx(expected[2], rel=1e-6)

@@ -30,13 +30,13 @@ def source_of(name: str, feed: Feed, message: list[str], ended: threading.Event,
         pipeline = Pipeline(rig)
         return pipeline, replayed(recording, pipeline)
 
-    def say(text: str, level: int = INFO, /) -> None:
+    def log(text: str, level: int = INFO, /) -> None:
         message.append(text)
         ended.set()
 
     first = next(iter(open_recording(BAGS / name).blocks()))
     inputs = [AppliedLoad(int(first.t_ns[0]) + k * 10**9, 0.0, -k, 0.0) for k in (3, 1, 0, 2)]
-    return ShownRecording(name, open_steps, feed, say, speed=speed, inputs=inputs)
+    return ShownRecording(name, open_steps, feed, log, speed=speed, inputs=inputs)
 
 
 def test_rates_are_of_a_second_however_long_ago_the_last_report_was(monkeypatch: pytest.MonkeyPatch) -> None:

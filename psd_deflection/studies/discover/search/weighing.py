@@ -35,7 +35,7 @@ MOST_OF_IT = 0.8
 """The same, by the share of what remains that it makes up: a few readings reach no small p."""
 STEPS_SHARE = 0.02
 """Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
-UNSAID = 1.5
+SIGNIFICANT = 1.5
 """A gap of more floors than this never remains without being reported as unknown."""
 BLOCKS_HZ = 25.0
 """What is faster is in no mean of a block, and so in no gap."""
@@ -104,7 +104,7 @@ def sd_of(workspace: Comparison, fit: Fit, index: int) -> dict[str, float]:
     tells how far it is off; the larger of the two is taken.
     """
     sd = workspace.sd(fit.jacobian, fit.covariance())
-    if workspace.open_level or workspace.gap(fit.difference) > UNSAID * workspace.floor():
+    if workspace.open_level or workspace.gap(fit.difference) > SIGNIFICANT * workspace.floor():
         sd = np.maximum(sd, scatter(workspace, fit))
     return {fit.free[j][1]: float(sd[j]) for j in fit.columns_of(index)}
 
@@ -161,7 +161,7 @@ def _beyond(gap: float, floor: float) -> float:
 def unnamed_gap(workspace: Comparison, before: float, after: float) -> tuple[Unknown, ...]:
     """What remains although no place of it stands out: several small differences, or the simulation's own error."""
     floor = workspace.floor()
-    if not after > UNSAID * floor:
+    if not after > SIGNIFICANT * floor:
         return ()
     size = _beyond(after, floor)
     words = f'{workspace.worded(size)} remain, {after / floor:.1f} times the noise, in no single place or band'
