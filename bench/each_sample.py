@@ -42,8 +42,8 @@ def measured(node_of: Node, seconds: float, block: int, busy: int) -> list[Row]:
         node = node_of.begin(device.port.name, '--record', folder)
         assert node.stderr is not None
         threading.Thread(target=node.stderr.read, daemon=True).start()
-        ear, bare = child('subscriber'), child('bare')
-        for one in (ear, bare):
+        subscriber, bare = child('subscriber'), child('bare')
+        for one in (subscriber, bare):
             assert one.stdout is not None
             one.stdout.readline()
         loops = [subprocess.Popen(BUSY_LOOP) for _ in range(busy)]
@@ -56,7 +56,7 @@ def measured(node_of: Node, seconds: float, block: int, busy: int) -> list[Row]:
         for loop in loops:
             loop.kill()
             loop.wait()
-        published, heard = bare.communicate()[0], ear.communicate()[0]
+        published, heard = bare.communicate()[0], subscriber.communicate()[0]
         node.terminate()
         node.wait(60.0)
         (recording,) = Path(folder).iterdir()

@@ -302,7 +302,7 @@ def measure(node_of: Node, seconds: float, settle: float, page: bool, into: Late
         # Its further output is read and ignored.
         threading.Thread(target=node.stderr.read, daemon=True).start()
         children = [child('subscriber'), child('bare'), *([child('looker', url)] if page else [])]
-        ear, bare = children[:2]
+        subscriber, bare = children[:2]
         for one in children:
             assert one.stdout is not None
             one.stdout.readline()
@@ -311,7 +311,7 @@ def measure(node_of: Node, seconds: float, settle: float, page: bool, into: Late
         time.sleep(seconds)
         into.shares.append((cpu_seconds(node.pid) - used) / (time.monotonic() - began))
         published, _ = bare.communicate()
-        heard, _ = ear.communicate()
+        heard, _ = subscriber.communicate()
         if page:
             reported, _ = children[2].communicate()
             # Even on a busy machine every block must arrive; up to half of them may still be under way.
@@ -374,7 +374,7 @@ def start(node_of: Node, times: int) -> Row:
     for _ in range(times):
         device = Device()
         device.thread.start()
-        ear = child('subscriber')
+        subscriber = child('subscriber')
         began: dict[str, int] = {}
         # Its own discovery is over before the others begin.
         time.sleep(START_S)
@@ -385,11 +385,11 @@ def start(node_of: Node, times: int) -> Row:
         node = node_of.begin(device.port.name)
         assert node.stderr is not None
         threading.Thread(target=node.stderr.read, daemon=True).start()
-        assert ear.stdout is not None
+        assert subscriber.stdout is not None
         # It says so once it has heard both.
-        ear.stdout.readline()
+        subscriber.stdout.readline()
         bare.communicate()
-        heard, _ = ear.communicate()
+        heard, _ = subscriber.communicate()
         node.terminate()
         node.wait(60.0)
         device.stop.set()

@@ -288,7 +288,7 @@ class SimulatedFrames:
         return bytes(out)
 
 
-class FramesEar:
+class FramesProbe:
     """Recognises a HELLO. ``baud``: the speed at which it listens, suggested as a parameter."""
 
     def __init__(self, baud: int) -> None:
@@ -296,7 +296,7 @@ class FramesEar:
         self._baud = baud
         self._decoder = FrameDecoder()
 
-    def hear(self, piece: bytes) -> Answer | None:
+    def feed(self, piece: bytes) -> Answer | None:
         """What the HELLO says."""
         for frame in self._decoder.feed(piece):
             if isinstance(frame, HelloFrame):
@@ -318,6 +318,6 @@ DEVICE = Device(
     'our own frames: firmware of ours, the simulated rig',
     ContractFrames,
     _simulate,
-    Probe(FramesEar, _QUESTION, baud=921_600),
+    Probe(FramesProbe, _QUESTION, baud=921_600),
     MOST_PSDS,
 )

@@ -333,7 +333,7 @@ class SimulatedDataq:
         return bytes(out)
 
 
-class DataqEar:
+class DataqProbe:
     """Recognises the replies to ``info 0`` and ``info 1``."""
 
     promising = False
@@ -341,7 +341,7 @@ class DataqEar:
     def __init__(self, baud: int) -> None:
         self._received = b''
 
-    def hear(self, piece: bytes) -> Answer | None:
+    def feed(self, piece: bytes) -> Answer | None:
         """Which model answers."""
         self._received = (self._received + piece)[-4096:]
         name = find_reply(self._received, 'info 1')
@@ -363,5 +363,5 @@ DEVICE = Device(
     Dataq,
     _simulate,
     # The carriage return ends bytes that the converter took for the start of a command.
-    Probe(DataqEar, b'\r' + command('info 0') + command('info 1')),
+    Probe(DataqProbe, b'\r' + command('info 0') + command('info 1')),
 )

@@ -75,7 +75,7 @@ class ProtocolProbe(Protocol):
 
     promising: bool
 
-    def hear(self, piece: bytes) -> Answer | None:
+    def feed(self, piece: bytes) -> Answer | None:
         """The device's answer, once ``piece`` completes it."""
 
 

@@ -50,25 +50,25 @@ class Port:
     asked: bool = True
 
 
-class _Ears:
+class _ProtocolProbes:
     """Listens for all protocols at once on ``port``; takes the first valid answer."""
 
     def __init__(self, port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> None:
         self.bytes = 0
         self.answered = False
         self._port = port
-        self._ears = [(name, probe.listen(baud)) for name, probe in probes]
+        self._probes = [(name, probe.listen(baud)) for name, probe in probes]
 
     @property
     def promising(self) -> bool:
         """Whether samples of a known device have come."""
-        return any(ear.promising for _, ear in self._ears)
+        return any(probe.promising for _, probe in self._probes)
 
-    def hear(self, piece: bytes) -> bool:
+    def feed(self, piece: bytes) -> bool:
         """Whether the device is now known."""
         self.bytes += len(piece)
-        for name, ear in self._ears:
-            answer = ear.hear(piece)
+        for name, probe in self._probes:
+            answer = probe.feed(piece)
             if answer is not None:
                 self._note(name, answer)
                 return True
@@ -118,8 +118,8 @@ def identify(port: Port, devices: Sequence[Device]) -> Port:
         speeds = speeds[:1]
     try:
         for baud in speeds:
-            ears = _ask(port, baud, probes)
-            if ears.answered or ears.promising or not ears.bytes:
+            found = _ask(port, baud, probes)
+            if found.answered or found.promising or not found.bytes:
                 break
             # A device sends, but not at this speed.
     except DeviceError as error:
@@ -128,31 +128,31 @@ def identify(port: Port, devices: Sequence[Device]) -> Port:
     return port
 
 
-def _ask(port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> _Ears:
+def _ask(port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> _ProtocolProbes:
     line = open_port(port.port, baud)
-    ears = _Ears(port, baud, probes)
+    found = _ProtocolProbes(port, baud, probes)
     try:
         for _, probe in probes:
             if probe.question:
                 line.write(probe.question)
-                if _listen(line, ears, ANSWER_S):
-                    return ears
-        if _listen(line, ears, ONCE_A_SECOND_S if ears.bytes else BOOT_S):
-            return ears
-        if ears.promising:
+                if _listen(line, found, ANSWER_S):
+                    return found
+        if _listen(line, found, ONCE_A_SECOND_S if found.bytes else BOOT_S):
+            return found
+        if found.promising:
             port.answer = 'samples come, but the device does not say what it is'
-        elif ears.bytes:
+        elif found.bytes:
             speed = f' at {baud} baud' if has_baud(port.port) else ''
-            port.answer = f'{ears.bytes} bytes that we cannot read{speed}'
+            port.answer = f'{found.bytes} bytes that we cannot read{speed}'
     finally:
         line.close()
-    return ears
+    return found
 
 
-def _listen(line: OpenPort, ears: _Ears, seconds: float) -> bool:
+def _listen(line: OpenPort, found: _ProtocolProbes, seconds: float) -> bool:
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0:
-        if ears.hear(line.read(left)):
+        if found.feed(line.read(left)):
             return True
     return False
 

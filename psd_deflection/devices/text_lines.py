@@ -230,7 +230,7 @@ class SimulatedLines:
         return bytes(out)
 
 
-class LinesEar:
+class LinesProbe:
     """Recognises a line that describes the device. ``baud``: the speed at which it listens, to be suggested."""
 
     def __init__(self, baud: int) -> None:
@@ -238,7 +238,7 @@ class LinesEar:
         self._baud = baud
         self._decoder = LineDecoder()
 
-    def hear(self, piece: bytes) -> Answer | None:
+    def feed(self, piece: bytes) -> Answer | None:
         """The device's answer from its description."""
         for item in self._decoder.feed(piece):
             if isinstance(item, Description) and 'sample_rate_hz' in item.info:
@@ -257,5 +257,5 @@ def _simulate(feed: RigFeed, power_up: PowerUp) -> Sequence[SimulatedLines]:
 
 
 DEVICE = Device(
-    'lines', 'a line of text a sample, as an Arduino sends it', TextLines, _simulate, Probe(LinesEar), MOST_PSDS
+    'lines', 'a line of text a sample, as an Arduino sends it', TextLines, _simulate, Probe(LinesProbe), MOST_PSDS
 )

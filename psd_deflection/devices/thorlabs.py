@@ -328,7 +328,7 @@ def _int16(value: float) -> int:
     return min(max(round(value), -32768), 32767)
 
 
-class AlignerEar:
+class AlignerProbe:
     """Recognises the hardware info of one aligner."""
 
     promising = False
@@ -336,7 +336,7 @@ class AlignerEar:
     def __init__(self, baud: int) -> None:
         self._decoder = AptDecoder()
 
-    def hear(self, piece: bytes) -> Answer | None:
+    def feed(self, piece: bytes) -> Answer | None:
         """Which aligner answers."""
         for message in self._decoder.feed(piece):
             if isinstance(message, HardwareInfo):
@@ -356,7 +356,7 @@ DEVICE = Device(
     ThorlabsPair,
     _simulate,
     Probe(
-        AlignerEar,
+        AlignerProbe,
         INFO_REQUEST,
         # It cannot detect a question in another protocol.
         first=True,

@@ -210,18 +210,18 @@ def test_a_silent_device_is_named(device: Any, rig: Rig, short_wait: ModuleType)
         Acquisition(rig, texts(print)).open()
 
 
-def hear_out(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
+def read_rest(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
     """The time to wait for a HELLO is over once ``answer`` was read."""
     heard = bytearray()
 
-    class Ear(SerialPort):
+    class Listener(SerialPort):
         def read(self, timeout: float) -> bytes:
             piece = super().read(timeout)
             heard.extend(piece)
             return piece
 
     def port(name: str, baud: int, **others: object) -> SerialPort:
-        return Ear(name, baud)
+        return Listener(name, baud)
 
     monkeypatch.setattr(port_source, 'open_port', port)
     clock = SimpleNamespace(monotonic=lambda: 1e6 if heard.endswith(answer) else 0.0)
@@ -230,14 +230,14 @@ def hear_out(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
 
 def test_a_device_that_talks_something_else_is_named(device: Any, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     device.answer = b'$GPGGA,123519,4807.038,N\r\n'
-    hear_out(monkeypatch, device.answer)
+    read_rest(monkeypatch, device.answer)
     with pytest.raises(DeviceError, match=r'26 bytes but no frame .* baud rate'):
         Acquisition(rig, texts(print)).open()
 
 
 def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     device.answer = b'\x00' + encode(sample(1)) + encode(sample(2))
-    hear_out(monkeypatch, device.answer)
+    read_rest(monkeypatch, device.answer)
     with pytest.raises(DeviceError, match='samples come but no HELLO'):
         Acquisition(rig, texts(print)).open()
 

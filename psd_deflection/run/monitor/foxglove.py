@@ -159,11 +159,11 @@ class FoxgloveServer(GatedServer):
                 event.clear()
 
         try:
-            return await self.look_on(request, socket, send, lambda message: self._hear(viewer, message))
+            return await self.look_on(request, socket, send, lambda message: self._receive(viewer, message))
         finally:
             self._looking.pop(socket, None)
 
-    def _hear(self, viewer: _Viewer, message: WSMessage) -> None:
+    def _receive(self, viewer: _Viewer, message: WSMessage) -> None:
         """What a viewer asks for; what is not understood is not answered."""
         if message.type is not WSMsgType.TEXT:
             return

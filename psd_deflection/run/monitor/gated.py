@@ -99,9 +99,9 @@ class GatedServer(abc.ABC):
         request: web.Request,
         viewer: web.WebSocketResponse,
         send: Callable[[web.WebSocketResponse, asyncio.Event], Coroutine[Any, Any, None]],
-        hear: Callable[[WSMessage], None] = lambda message: None,
+        feed: Callable[[WSMessage], None] = lambda message: None,
     ) -> web.WebSocketResponse:
-        """Let ``viewer`` look on until it leaves: ``send`` runs beside, ``hear`` gets what it says."""
+        """Let ``viewer`` look on until it leaves: ``send`` runs beside, ``feed`` gets what it says."""
         await viewer.prepare(request)
         if len(self.viewers) >= VIEWERS:
             # A page learns the reason of a close, but not that of a failed handshake.
@@ -115,7 +115,7 @@ class GatedServer(abc.ABC):
             async for message in viewer:
                 if message.type is WSMsgType.ERROR:
                     break
-                hear(message)
+                feed(message)
         finally:
             del self.viewers[viewer]
             self._looked_through.discard(request.protocol)
