@@ -138,7 +138,10 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         more = '' if r['outcome'] != 'limits' else ', separable' if r['separable'] else ', nor would all together'
         wrong = '' if r['right'] else ' WRONG'
         lines.append(f'{words}; {r["outcome"]} after {r["recordings"]}{more}{wrong}')
-        lines += [f'    {" | ".join(rivals)}: {words}' for rivals, words in zip(r['left'], r['planned'], strict=True)]
+        lines += [
+            f'    {" | ".join(alternatives)}: {words}'
+            for alternatives, words in zip(r['left'], r['planned'], strict=True)
+        ]
     alone = [r for r in rows if r['kind'] == 'alone']
     unseen = sum(r['kind'] == 'hidden' for r in rows)
     lines.append(f'{len(rows)} recordings; {unseen} cannot show their effect')

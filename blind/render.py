@@ -271,11 +271,11 @@ def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float]) -
     middle = sampled(everywhere, 0.0, 0.0).reshape(everywhere.shape)
     ends = [sampled(everywhere, du, dv).reshape(middle.shape) for du in (-0.5, 0.5) for dv in (-0.5, 0.5)]
     edge = np.any(np.array(ends) != middle, axis=0)
-    lattice = [((i + 0.5) / 21, (13 * i % 21 + 0.5) / 21) for i in range(21)]
+    offsets = [((i + 0.5) / 21, (13 * i % 21 + 0.5) / 21) for i in range(21)]
     fine = np.repeat(np.repeat(middle, CUTS, axis=0), CUTS, axis=1)
     for i in range(CUTS):
         for j in range(CUTS):
-            parts = [sampled(edge, (j + du) / CUTS - 0.5, (i + dv) / CUTS - 0.5) for du, dv in lattice]
+            parts = [sampled(edge, (j + du) / CUTS - 0.5, (i + dv) / CUTS - 0.5) for du, dv in offsets]
             fine[i::CUTS, j::CUTS][edge] = np.mean(parts, axis=0)
     return np.asarray(scene.black + (scene.white - scene.black) * together(fine, scene))
 

@@ -192,8 +192,8 @@ class Campaign(Graph):
             self._scale, plant.stands = 0.0, True
             self._scaling.publish(Float64(data=0.0))
         elif name == 'another publisher':
-            rival = self.node.create_publisher(Float64MultiArray, '/compensator/offsets', 5)
-            return lambda: self._destroy(rival)
+            other_publisher = self.node.create_publisher(Float64MultiArray, '/compensator/offsets', 5)
+            return lambda: self._destroy(other_publisher)
         else:
             plant.stands = True
             plant.arm.force *= 1.4

@@ -357,12 +357,12 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
     def _check_robot(self) -> None:
         """Hold while the robot does not run, or while another node publishes what we publish."""
         now = time.monotonic()
-        rivals = self.rivals() if self._drive else []
-        other = f'another node publishes {rivals[0]}' if rivals else ''
+        other_publishers = self.other_publishers() if self._drive else []
+        other = f'another node publishes {other_publishers[0]}' if other_publishers else ''
         if self._drive and now - self._begun < LOOK_S:
             other = other or 'it looks whether another node commands the robot'
         with self._lock:
-            self.compensator.stop(other or self._robot.fault(now), rival=bool(other))
+            self.compensator.stop(other or self._robot.fault(now), other_publisher=bool(other))
 
     def _send_until_the_end(self) -> None:
         """Send the offsets every ``PERIOD_S``; a time that was missed is left out."""

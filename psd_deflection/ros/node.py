@@ -116,7 +116,7 @@ class BaseNode(abc.ABC, Generic[T]):
         self.error: Exception | None = None
         self.finished = self.active = False
         self._starting = False
-        self._rivals: frozenset[str] = frozenset()
+        self._other_publishers: frozenset[str] = frozenset()
         self._published: list[Publisher] = []
         self._diagnostics: Publisher | None = None
         self.node = _made(name, overrides)
@@ -205,7 +205,7 @@ class BaseNode(abc.ABC, Generic[T]):
         """``/NAMESPACE/NAME``."""
         return str(self.node.get_fully_qualified_name())
 
-    def rivals(self) -> list[str]:
+    def other_publishers(self) -> list[str]:
         """The topics of :meth:`watched` that another node publishes, too."""
         return [topic for topic in self.watched() if self.node.count_publishers(topic) > 1]
 
@@ -323,11 +323,11 @@ class BaseNode(abc.ABC, Generic[T]):
 
     def _every_second(self) -> None:
         self.gate.settle()
-        rivals = frozenset(self.rivals())
-        for topic in sorted(rivals - self._rivals):
+        other_publishers = frozenset(self.other_publishers())
+        for topic in sorted(other_publishers - self._other_publishers):
             remedy = 'start one of them in a namespace (-r __ns:=/NAME)'
             self.log(f'another node publishes on {topic} too: {remedy}', WARNING)
-        self._rivals = rivals
+        self._other_publishers = other_publishers
         self.report()
 
 

@@ -104,9 +104,9 @@ class ShaperNode(BaseNode[ShaperSettings]):
 
     def _shape(self, message: Any) -> Any:
         """The message of a trajectory, shaped. Raises ConfigError for one that cannot be followed."""
-        if rivals := self.rivals():
+        if other_publishers := self.other_publishers():
             # Both would answer, and the arm would get each motion twice.
-            raise ConfigError(f'another node publishes {rivals[0]}')
+            raise ConfigError(f'another node publishes {other_publishers[0]}')
         if self._undescribed:
             raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
         trajectory = _trajectory(message)
@@ -153,8 +153,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
     def _state(self) -> tuple[int, str]:
         if not self.active:
             return STALE, 'not active'
-        if rivals := self.rivals():
-            return WARN, f'it shapes nothing: another node publishes {rivals[0]}'
+        if other_publishers := self.other_publishers():
+            return WARN, f'it shapes nothing: another node publishes {other_publishers[0]}'
         if self._why:
             return WARN, f'the last trajectory was rejected: {self._why}'
         if self._undescribed:

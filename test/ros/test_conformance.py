@@ -584,11 +584,11 @@ def test_rejections_are_warnings(running: Running) -> None:
 def test_second_publisher_is_reported(running: Running) -> None:
     kind, topic = running.profile.published
     name = f'{NAMESPACE}/{topic}'
-    rival = running.peer.node.create_publisher(kind, name, 5)
+    alternative = running.peer.node.create_publisher(kind, name, 5)
     try:
         running.peer.until(lambda: running.logged(f'another node publishes on {name} too', 30), 'the warning')
     finally:
-        running.peer.node.destroy_publisher(rival)
+        running.peer.node.destroy_publisher(alternative)
 
 
 def test_its_topics_are_rows_of_the_table(running: Running) -> None:

@@ -140,7 +140,7 @@ class Compensator:
         self._anchor: tuple[FloatArray, FloatArray] | None = None
         self._away_t: float | None = None
         self._stop = self._broken = ''
-        self._rival = False
+        self._other_publisher = False
         self._last: Observed | None = None
         self._last_now = -math.inf
         self._good = settings.good
@@ -191,15 +191,16 @@ class Compensator:
             self.response.begin(self._offsets)
         self._anchor = self._away_t = self._held_t = None
 
-    def stop(self, why: str, *, rival: bool = False) -> None:
-        """Hold for as long as ``why`` is not '': the robot does not run, or, with ``rival``, somebody else commands it.
+    def stop(self, why: str, *, other_publisher: bool = False) -> None:
+        """Hold for as long as ``why`` is not '': the robot does not run, or, with ``other_publisher``, somebody else
+        commands it.
 
         While a rival does, offsets that the controller still has after we fell silent are not taken back either.
         """
         if self._stop and not why and self._fault == self._stop:
             # That is over. What it waits for now is what comes next, or does not come.
             self._fault = AWAITED
-        self._stop, self._rival = why, rival
+        self._stop, self._other_publisher = why, other_publisher
 
     def controller_has(self, now: float, values: FloatArray) -> None:
         """What the controller tells, where ours begin: the offsets that it applies, or its command (n,), rad or m."""
@@ -266,7 +267,7 @@ class Compensator:
         self._look(now)
         if not self._speaks and self.enabled:
             self._unready = '' if self._fault else self._begin(now)
-        elif not self._speaks and self._owed and not self._rival:
+        elif not self._speaks and self._owed and not self._other_publisher:
             self._unready = self._begin(now)
         self._foreign = self._look_for_foreign(now)
         self._give_up(now)

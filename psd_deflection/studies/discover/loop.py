@@ -142,7 +142,7 @@ def run_loop(
         plan = next_of(discovery, limits)
         # A rival with more parameters that came out as the named effect would be has nothing left that could be tested:
         # nothing within the limits needs its further ones.
-        needed = any(rival.parameters <= discovery.fit.parameters for rival in discovery.alternative_fits)
+        needed = any(alternative.parameters <= discovery.fit.parameters for alternative in discovery.alternative_fits)
         if plan is None or not (plan.useful or (discovery.unsettled and needed)):
             return LoopResult(discovery, tuple(plans), None, 'unique')
         if not plan.useful:

@@ -25,9 +25,9 @@ from psd_deflection.studies.discover.search.remainder import Remainder, remainde
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
+    ALTERNATIVE_BIC,
     EQUIVALENT,
     EQUIVALENT_BIC,
-    RIVAL_BIC,
     SIGNIFICANT,
     Alternative,
     NamedEffect,
@@ -215,7 +215,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         rows.append((f.effects[-1].effect.name, loss, bic))
         if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
             equal.append(f)
-        if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
+        if (bic < ALTERNATIVE_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
             fitted_alternatives.append(Alternative(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
     return NamedEffect(
         active=fit.effects[index],

@@ -27,7 +27,7 @@ TRIED = 5
 """Offsets that are refined."""
 APART = 5
 """Samples between two offsets that are tried, at least."""
-RIVAL = 20.0
+ALTERNATIVE_LOSS = 20.0
 """An offset is a rival if its chi-square is larger by less."""
 MOVES = 100.0
 """The motion explains the reference if it lowers chi-square by more. With noise alone the best of thousands of offsets,
@@ -48,7 +48,7 @@ class Offset:
     """What to add to the reference's stamps, s.
 
     ``value``, ``sd``: s. ``drift``, ``drift_sd``: by how much the offset grows with time, s/s. ``explained``: whether
-    the motion explains the reference at this offset. ``rivals``: other offsets that fit as well, s. ``used``:
+    the motion explains the reference at this offset. ``alternatives``: other offsets that fit as well, s. ``used``:
     references in the fit.
     """
 
@@ -57,13 +57,13 @@ class Offset:
     drift: float
     drift_sd: float
     explained: bool
-    rivals: tuple[float, ...]
+    alternatives: tuple[float, ...]
     used: int
 
     @property
     def determined(self) -> bool:
         """Whether the motion tells the offset."""
-        return self.explained and self.sd < VAGUE and not self.rivals
+        return self.explained and self.sd < VAGUE and not self.alternatives
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -74,8 +74,8 @@ class Offset:
     def sentence(self) -> str:
         """Which clock is ahead, and what to add to what."""
         if not self.determined:
-            if self.explained and self.rivals:
-                alternatives = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
+            if self.explained and self.alternatives:
+                alternatives = ', '.join(f'{1e3 * r:+.1f}' for r in self.alternatives)
                 return (
                     'The offset between the clocks is not told: the motion repeats itself, so that '
                     f'{1e3 * self.value:+.1f} and {alternatives} ms fit alike. '
@@ -139,7 +139,7 @@ def clock_offset(
         base = float(motion.t[0] - t[0])
         largest = float(max(t[-1] - t[0], motion.t[-1] - motion.t[0]))
     fitted = offset_near(motion, t + base, poses, largest, exposure)
-    return replace(fitted, value=fitted.value + base, rivals=tuple(r + base for r in fitted.rivals))
+    return replace(fitted, value=fitted.value + base, alternatives=tuple(r + base for r in fitted.alternatives))
 
 
 def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
@@ -161,7 +161,9 @@ def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float
     least = best.chi_square(best.sizes)
     near = APART * motion.period
     alternatives = tuple(
-        f.value for f in fits if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < RIVAL
+        f.value
+        for f in fits
+        if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < ALTERNATIVE_LOSS
     )
     explained = used * (biweight_sum((poses - np.median(poses, axis=0)) / best.sizes) - least)
     return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, alternatives, used)
@@ -237,7 +239,7 @@ def refined_offset(
         fit.value = value
         if passed > 0 and best is not None:
             worse = len(fit.residual) * (fit.chi_square(best.sizes) - best.chi_square(best.sizes))
-            if worse > 10.0 * RIVAL:
+            if worse > 10.0 * ALTERNATIVE_LOSS:
                 break
         if passed > 1 and abs(step) < SETTLED:
             break

@@ -30,7 +30,7 @@ PERIOD = 0.02
 ELBOW = np.array([1.2, 0.6])
 PAYLOAD = np.array([0.0, 0.0, -40.0])
 CERTAIN = np.eye(6) * 1e-12
-RIVAL = 'another node publishes'
+OTHER_PUBLISHER = 'another node publishes'
 
 
 @pytest.fixture(scope='module')
@@ -514,7 +514,7 @@ def test_switched_off_while_nothing_is_reported_the_offsets_go_back_once_it_is(a
     assert np.array_equal(loop.offsets, left)
     # Not while somebody else commands the robot.
     loop.reports = True
-    loop.compensator.stop(RIVAL, rival=True)
+    loop.compensator.stop(OTHER_PUBLISHER, other_publisher=True)
     loop.run(0.2)
     assert len(loop.sent) == count
     loop.compensator.stop('')
@@ -759,7 +759,7 @@ EVENT = st.one_of(
     st.tuples(st.just('age'), NUMBERS),
     st.tuples(st.just('applied'), st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))),
     st.tuples(st.just('enable'), st.booleans()),
-    st.tuples(st.just('stop'), st.sampled_from(['', 'the robot does not run', RIVAL])),
+    st.tuples(st.just('stop'), st.sampled_from(['', 'the robot does not run', OTHER_PUBLISHER])),
     st.tuples(st.just('pause'), st.floats(-1.0, 5.0)),
     st.tuples(st.just('clock'), st.floats(-1e5, 1e5)),
     st.tuples(st.just('late'), st.floats(0.0, 0.5)),
@@ -786,7 +786,7 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
             if kind == 'enable':
                 compensator.enable(value)
             elif kind == 'stop':
-                compensator.stop(value, rival=value == RIVAL)
+                compensator.stop(value, other_publisher=value == OTHER_PUBLISHER)
             elif kind == 'pause':
                 now += max(value, 0.0)
             elif kind == 'clock':

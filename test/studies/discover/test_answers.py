@@ -421,8 +421,8 @@ def test_the_best_of_each_variant_is_tried() -> None:
 # Plans.
 
 
-def reported_of(rival: str, separation: float, reverse: float, possible: float) -> Discrimination:
-    return Discrimination(rival, 'creep', separation, reverse, possible)
+def reported_of(alternative: str, separation: float, reverse: float, possible: float) -> Discrimination:
+    return Discrimination(alternative, 'creep', separation, reverse, possible)
 
 
 def test_a_plan_says_what_it_separates() -> None:
@@ -850,11 +850,11 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
-    rival = Alternative(named.active, {'angle': 1e-3}, 4.0, found.fit)
-    listed_rivals = dataclasses.replace(
-        found, effects=(dataclasses.replace(named, fitted_alternatives=(rival,)),)
+    alternative = Alternative(named.active, {'angle': 1e-3}, 4.0, found.fit)
+    listed_alternatives = dataclasses.replace(
+        found, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),)
     ).tree()
-    assert listed_rivals['effects'][0]['rivals'] == [
+    assert listed_alternatives['effects'][0]['rivals'] == [
         {
             'name': 'sensor_rotation',
             'parameters': {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}},

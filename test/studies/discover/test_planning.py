@@ -52,8 +52,8 @@ def models() -> tuple[Workspace, Fit, Fit]:
 
 @pytest.fixture(scope='module')
 def plan(models: tuple[Workspace, Fit, Fit]) -> Plan:
-    workspace, named, rival = models
-    planned = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, seconds=12.0))
+    workspace, named, alternative = models
+    planned = plan_next(workspace, named, [alternative], Limits(swing=0.0, sweep=0.0, seconds=12.0))
     assert planned is not None
     return planned
 
@@ -79,8 +79,8 @@ def test_another_length_is_planned_where_only_that_reports(plan: Plan) -> None:
 
 @pytest.mark.slow
 def test_it_is_reported_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
-    workspace, named, rival = models
-    plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
+    workspace, named, alternative = models
+    plan = plan_next(workspace, named, [alternative], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
     assert plan is not None
     assert not plan.useful
     assert plan.sentence.startswith('No recording within the limits would tell bending_stiffness')
@@ -89,11 +89,11 @@ def test_it_is_reported_if_nothing_within_the_limits_reports(models: tuple[Works
 
 
 def test_what_pieces_show_adds_up_to_what_the_recording_shows(models: tuple[Workspace, Fit, Fit]) -> None:
-    workspace, named, rival = models
+    workspace, named, alternative = models
     short = Setting('', {'link.length': 0.4})
     first = loads.steps([(0, 0, 0), (0, -50, 0)], 3.0).loads
     second = loads.steps([(0, -50, 0), (0, 0, 0)], 3.0).loads
-    both = [named, rival]
+    both = [named, alternative]
     one_by_one = (
         expected_sums(workspace, both, short, first) + expected_sums(workspace, both, short, second[3000:]) * 2.0
     )
@@ -189,9 +189,9 @@ class Searches:
     def search(self, known: Sequence[Observation]) -> Discovery:
         self.observed.append(len(known))
         left = ('other',) * max(self.equivalents - len(known) + 1, 0)
-        rivals = [SimpleNamespace(parameters=self.free)] * len(left)
+        alternatives = [SimpleNamespace(parameters=self.free)] * len(left)
         return cast(
-            Discovery, SimpleNamespace(unsettled=left, alternative_fits=rivals, fit=SimpleNamespace(parameters=1))
+            Discovery, SimpleNamespace(unsettled=left, alternative_fits=alternatives, fit=SimpleNamespace(parameters=1))
         )
 
     def settle(self, most: int | None = None) -> loop.LoopResult:

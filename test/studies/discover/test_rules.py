@@ -875,14 +875,14 @@ def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypat
     volts = ForwardModel(RIG, [given]).expect(history.loads, None).volts.T
     volts = volts + 2e-3 * np.random.default_rng(0).standard_normal(volts.shape)
     workspace = Workspace([Observation('seen', RIG, volts, history.loads)])
-    named, rival = refit(workspace, [given]), refit(workspace, [other])
+    named, alternative = refit(workspace, [given]), refit(workspace, [other])
     new = loads.steps([(0, 0, 0), (30, 0, 0)], 0.4)
     shorter = experiment.Setting('', {'link.length': 0.4})
     offered = experiment.Proposal(shorter, experiment.Piece('pull', ('steps:0,0,0;30,0,0:0.4',)))
     idle = experiment.Proposal(experiment.Setting(), experiment.Piece('wait', ('constant:0,0,0:0.4',)))
     monkeypatch.setattr(planning, 'proposals', lambda *_: [idle, offered])
-    plan = planning.plan_next(workspace, named, [rival], experiment.Limits(seconds=0.8))
-    found = planning.suggest(workspace, named, [rival], experiment.Limits(seconds=0.8))
+    plan = planning.plan_next(workspace, named, [alternative], experiment.Limits(seconds=0.8))
+    found = planning.suggest(workspace, named, [alternative], experiment.Limits(seconds=0.8))
     assert plan is not None
     assert found is not None
     assert found.words == 'pull'
@@ -892,12 +892,12 @@ def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypat
     def there(a: ActiveEffect) -> FloatArray:
         return fine_means(ForwardModel(short, [a]).expect(new.loads, None).volts, 4) / sigma
 
-    (name,) = [n for _, n in rival.free]
-    size = rival.effects[0].values[name]
+    (name,) = [n for _, n in alternative.free]
+    size = alternative.effects[0].values[name]
 
     def apart(change: float) -> float:
-        moved = ActiveEffect(rival.effects[0].effect, {**rival.effects[0].values, name: size + change})
-        old = change**2 * float(np.sum(rival.jacobian**2))
+        moved = ActiveEffect(alternative.effects[0].effect, {**alternative.effects[0].values, name: size + change})
+        old = change**2 * float(np.sum(alternative.jacobian**2))
         return float(np.sum((there(named.effects[0]) - there(moved)) ** 2)) + old
 
     reach = 0.5 * abs(size)

@@ -538,8 +538,8 @@ def test_of_so_coarse_steps_four_values_are_enough(values: int, observed: bool) 
     assert (coarse_step(o) is not None) == observed
 
 
-@pytest.mark.parametrize(('loss', 'is_rival'), [(6.9, True), (7.1, False)])
-def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None:
+@pytest.mark.parametrize(('loss', 'is_alternative'), [(6.9, True), (7.1, False)])
+def test_what_comes_close_in_bic_is_a_rival(loss: float, is_alternative: bool) -> None:
     """By up to 10, with 3 for its further parameter; an equivalent one would have to be as close as 6."""
     shown = pictures(A)
     search = searching(Plant(shown, without_noise((shown[A], 500.0))), shown, 'a')
@@ -555,8 +555,8 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
     assert found.equivalent == ()
     assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.fitted_alternatives] == [
         ('b', loss + 3.0, other)
-    ] * is_rival
-    if is_rival:
+    ] * is_alternative
+    if is_alternative:
         assert found.fitted_alternatives[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
     # One that ran into its bound is none.
     stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))

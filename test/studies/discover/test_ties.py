@@ -24,9 +24,9 @@ def stiffness(name: str, scale: float, moves: int = 0) -> ActiveEffect:
     return make_active(f'{name}_stiffness', {'scale': scale, 'moves_frequency': moves}, 'test')
 
 
-def named(active: ActiveEffect, sd: float, *rivals: Alternative) -> NamedEffect:
+def named(active: ActiveEffect, sd: float, *alternatives: Alternative) -> NamedEffect:
     amplitude = next(p.name for p in active.effect.parameters if p.kind == 'amplitude')
-    return NamedEffect(active, {amplitude: sd}, 1e-9, 50.0, HeldOut(9.0, 1.0), (), rivals, (), None)
+    return NamedEffect(active, {amplitude: sd}, 1e-9, 50.0, HeldOut(9.0, 1.0), (), alternatives, (), None)
 
 
 def test_a_radius_the_material_or_the_loads_explain_both_stiffnesses() -> None:
@@ -54,8 +54,8 @@ def test_if_the_modes_moved_it_is_not_the_loads() -> None:
 
 def test_a_rival_may_be_the_half_of_a_tie() -> None:
     clamp = make_active('clamp_torsional_compliance', {'compliance': 2e-5}, 'test')
-    rival = Alternative(stiffness('torsional', -0.04), {'scale': 1e-5}, 0.0, FIT)
-    (tie,) = ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8, rival)])
+    alternative = Alternative(stiffness('torsional', -0.04), {'scale': 1e-5}, 0.0, FIT)
+    (tie,) = ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8, alternative)])
     assert tie.share == pytest.approx(-0.04)
     assert ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8)]) == ()
 

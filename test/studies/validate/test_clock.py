@@ -77,5 +77,5 @@ def test_a_motion_that_repeats_has_rivals() -> None:
     poses = np.column_stack([1e-3 * np.sin(2 * np.pi * 5.0 * at), np.zeros((len(at), 2))]) + noise
     found = clock_offset(motion, at, poses)
     assert not found.determined
-    assert any(abs(abs(r - found.value) - 0.2) < 2e-3 for r in found.rivals)
+    assert any(abs(abs(r - found.value) - 0.2) < 2e-3 for r in found.alternatives)
     assert 'repeats itself' in found.sentence

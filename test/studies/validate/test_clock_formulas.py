@@ -188,13 +188,13 @@ def test_the_best_fit_is_taken_and_what_fits_as_well_is_a_rival(monkeypatch: pyt
     assert (found.value, found.sd, found.drift, found.drift_sd) == (0.1, 0.101, 2e-6, 3e-6)
     assert found.used == 50
     places = (0.3, 0.1 + 5.1 / 256.0, 0.1 - 5.1 / 256.0, 0.5 + 4.9 / 256.0, -0.5 - 4.9 / 256.0)
-    assert found.rivals == pytest.approx(places)
+    assert found.alternatives == pytest.approx(places)
     assert reported == [None, 0.3, 0.3, *[0.1] * 9]
 
 
 def test_five_samples_apart_is_near_still(monkeypatch: pytest.MonkeyPatch) -> None:
     fits = [fit_with(0.25, 0.1), fit_with(0.25 + 5.0 / 256.0, 0.2), fit_with(0.5 + 5.0 / 256.0, 0.2)]
-    assert found_of(monkeypatch, fits, np.zeros((50, 3)))[0].rivals == (0.5 + 5.0 / 256.0,)
+    assert found_of(monkeypatch, fits, np.zeros((50, 3)))[0].alternatives == (0.5 + 5.0 / 256.0,)
 
 
 @pytest.mark.parametrize(('level', 'explained'), [(101.0, True), (99.0, False)])

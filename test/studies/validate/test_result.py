@@ -79,7 +79,7 @@ def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
         (replace(BEHIND, value=-0.19e-3), False, None),
         # It is large, but nobody knows how large.
         (replace(BEHIND, explained=False), False, None),
-        (replace(BEHIND, rivals=(0.2,)), False, None),
+        (replace(BEHIND, alternatives=(0.2,)), False, None),
     ],
 )
 def test_whether_the_offset_is_removed_is_reported_if_there_is_one(

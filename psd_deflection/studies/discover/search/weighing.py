@@ -39,7 +39,7 @@ SIGNIFICANT = 1.5
 """A gap of more floors than this never remains without being reported as unknown."""
 BLOCKS_HZ = 25.0
 """What is faster is in no mean of a block, and so in no gap."""
-RIVAL_BIC = 10.0
+ALTERNATIVE_BIC = 10.0
 """An effect in place of the named one counts as its rival up to this loss in BIC."""
 
 
