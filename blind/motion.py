@@ -10,9 +10,9 @@ go through the whole pipeline.
 
 Columns: rms error of the velocity by the filter (``own``: what its covariance says), and by the Savitzky-Golay filter
 of block means that does best, which knows the future; normalised innovations squared a sample, ``inside``: share of
-the seconds in which they are in their 95 % band; rms error of the pose between the blocks, foretold and held.
+the seconds in which they are in their 95 % band; rms error of the pose between the blocks, predicted and held.
 
-Below the table: the same error by frequency, from the chirp, as the largest ratio of foretold to held up to the first
+Below the table: the same error by frequency, from the chirp, as the largest ratio of predicted to held up to the first
 mode; and the share of the poses that are inside three standard deviations after 100 ms without samples.
 """
 
@@ -220,7 +220,7 @@ class Result:
     """Of B blocks in motion; (B, 3) unless said otherwise.
 
     ``velocity``, ``own``: error of the velocity at the end of a block, and the standard deviation that it is given.
-    ``smoothed``: error of the best Savitzky-Golay filter in the middle. ``squares``: NIS of a block. ``foretold``,
+    ``smoothed``: error of the best Savitzky-Golay filter in the middle. ``squares``: NIS of a block. ``predicted``,
     ``held`` (20 B, 3): error of the pose at each sample until the next block is there. ``pose``, ``pose_own``.
     ``unseen``: error of the pose 100 ms after the block if no more samples come, in standard deviations; NaN in the
     last five.
@@ -230,7 +230,7 @@ class Result:
     own: Array
     smoothed: Array
     squares: Array
-    foretold: Array
+    predicted: Array
     held: Array
     pose: Array
     pose_own: Array
@@ -296,7 +296,7 @@ def judge(run: Run, rig: Rig, late: int = 0) -> Result:
 
     velocity, own, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
     pose, pose_own = np.zeros((blocks, 3)), np.zeros((blocks, 3))
-    foretold, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
+    predicted, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
     unseen = np.full((blocks, 3), np.nan)
     first = int(REST * RATE) // BLOCK
     for block in range(blocks):
@@ -316,7 +316,7 @@ def judge(run: Run, rig: Rig, late: int = 0) -> Result:
             raise RuntimeError(f'block {block} has no estimate')
         if first - 1 <= block < blocks - 1:
             ahead = slice(BLOCK * (block + 1), BLOCK * (block + 2))
-            foretold[ahead] = motion.predicted(LATER).pose - run.pose[ahead]
+            predicted[ahead] = motion.predicted(LATER).pose - run.pose[ahead]
             held[ahead] = np.array(estimate.pose) - run.pose[ahead]
         at = BLOCK * (block + 1) - 1 + UNSEEN
         if at < len(run.pose):
@@ -332,7 +332,7 @@ def judge(run: Run, rig: Rig, late: int = 0) -> Result:
         own[part],
         _smoothed(run, part),
         squares[part],
-        foretold[samples],
+        predicted[samples],
         held[samples],
         pose[part],
         pose_own[part],
@@ -345,7 +345,7 @@ class Figures:
     """Of one axis; rms values in m, rad, m/s, rad/s.
 
     ``velocity``: error, ``own``: what the filter says of it, ``smoothed``: that of Savitzky and Golay. ``nis`` a
-    sample; ``inside``: share of the blocks whose NIS is in its 95 % band. ``foretold``, ``held``: errors of the pose.
+    sample; ``inside``: share of the blocks whose NIS is in its 95 % band. ``predicted``, ``held``: errors of the pose.
     """
 
     velocity: float
@@ -353,7 +353,7 @@ class Figures:
     smoothed: float
     nis: float
     inside: float
-    foretold: float
+    predicted: float
     held: float
 
 
@@ -363,18 +363,18 @@ def figures(results: Iterable[Result]) -> list[Figures]:
     low, high = (float(chi2.ppf(p, BLOCK)) for p in (0.025, 0.975))
     out = []
     for axis in range(3):
-        velocity, own, smoothed, squares, foretold, held = (
+        velocity, own, smoothed, squares, predicted, held = (
             np.concatenate([getattr(result, name)[:, axis] for result in results])
-            for name in ('velocity', 'own', 'smoothed', 'squares', 'foretold', 'held')
+            for name in ('velocity', 'own', 'smoothed', 'squares', 'predicted', 'held')
         )
         inside = float(np.mean((squares > low) & (squares < high)))
         nis = float(squares.mean()) / BLOCK
-        out.append(Figures(rms(velocity), rms(own), rms(smoothed), nis, inside, rms(foretold), rms(held)))
+        out.append(Figures(rms(velocity), rms(own), rms(smoothed), nis, inside, rms(predicted), rms(held)))
     return out
 
 
 def by_frequency(results: Iterable[Result]) -> list[float]:
-    """Largest ratio of foretold to held rms error over the bands of a chirp up to the mode, of each axis."""
+    """Largest ratio of predicted to held rms error over the bands of a chirp up to the mode, of each axis."""
     results = list(results)
     out = []
     for axis in range(3):
@@ -382,11 +382,11 @@ def by_frequency(results: Iterable[Result]) -> list[float]:
         # From 0.5 Hz to 1.2 times the mode, evenly in time.
         below = math.floor(BANDS * (1.0 - 0.5 / MODES[axis][0]) / (1.2 - 0.5 / MODES[axis][0]))
         for band in range(below):
-            foretold, held = (
+            predicted, held = (
                 np.concatenate([np.array_split(getattr(r, name)[:, axis], BANDS)[band] for r in results])
-                for name in ('foretold', 'held')
+                for name in ('predicted', 'held')
             )
-            ratios.append(rms(foretold) / rms(held))
+            ratios.append(rms(predicted) / rms(held))
         out.append(max(ratios))
     return out
 
@@ -394,7 +394,7 @@ def by_frequency(results: Iterable[Result]) -> list[float]:
 def table(found: Mapping[str, list[Figures]]) -> str:
     """Return a Markdown table."""
     rows = [
-        '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | foretold | held |',
+        '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | predicted | held |',
         '|---' * 10 + '|',
     ]
     for kind, axes in found.items():
@@ -403,7 +403,7 @@ def table(found: Mapping[str, list[Figures]]) -> str:
             rows.append(
                 f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.own * 1e3:.3f} | {f.velocity / f.own:.2f} '
                 f'| {f.velocity / f.smoothed:.3f} | {f.nis:.3f} | {f.inside:.1%} '
-                f'| {f.foretold * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
+                f'| {f.predicted * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
             )
     return '\n'.join(rows)
 
@@ -428,7 +428,7 @@ def main() -> None:
     print(table({kind: figures(results) for kind, results in judged.items()}))
     if 'chirp' in judged:
         print(
-            'foretold / held at its worst up to the mode: '
+            'predicted / held at its worst up to the mode: '
             + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, by_frequency(judged['chirp']), strict=True))
         )
     for kind, results in judged.items():

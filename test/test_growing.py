@@ -35,7 +35,7 @@ GROWS = {'append', 'appendleft', 'add', 'setdefault', 'extend', 'update', 'put',
 
 BOUNDED_BY = {
     'arms/compensation/response.py:_rows': 'MOST_ROWS',
-    'arms/compensation/response.py:suspects': 'the joints of the arm',
+    'arms/compensation/response.py:candidates': 'the joints of the arm',
     'arms/inputs.py:_reported': 'LONGEST_LIST',
     'camera/lens.py:_grids': 'one size of image a camera',
     'camera/reference.py:_waiting': '20 MOST_REST, or twice rest.frames',
@@ -78,7 +78,7 @@ BOUNDED_BY = {
     'run/alarm_out.py:_ways': 'a command and an address',
     'run/chain.py:sessions': 'the links of the chain',
     'run/fleet/tasks.py:_ready': 'the slots of the engine',
-    'run/fleet/tasks.py:_suspects': 'the list that was given',
+    'run/fleet/tasks.py:_to_retry': 'the list that was given',
     'run/fleet/tasks.py:_under_way': 'the slots of the engine',
     'run/monitor/feed.py:_queue': 'QUEUE_ITEMS',
     'run/monitor/foxglove.py:_channels': 'our own topics',

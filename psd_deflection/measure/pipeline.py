@@ -267,9 +267,9 @@ class Pipeline:
             motion.load(AppliedLoad(joined_ns(load[0], load[1]), load[2], load[3], load[4]))
 
     @property
-    def gathers(self) -> int:
+    def buffers(self) -> int:
         """How many numbers the segment of the noise under way makes of :meth:`memory`; 0 between two segments."""
-        return self.estimator.noise.gathered
+        return self.estimator.noise.buffered
 
     def memory(self, rig: Rig) -> ParameterChange | None:
         """The state that the next block depends on besides its samples and ``rig``; None if there is none.

@@ -218,7 +218,7 @@ class Watch:
 
     def __init__(self, rig: Rig, compliance: Sequence[float]) -> None:
         self._compliance = tuple(compliance)
-        self._wander = rig.acquisition.watch_wander
+        self._allowed_drift = rig.acquisition.watch_wander
         self._blocks = max(5, round(WINDOW_S * rig.converter.sample_rate_hz / rig.estimator.block_size))
         self._window_ns = round(1e9 * self._blocks * rig.estimator.block_size / rig.converter.sample_rate_hz)
         count = len(rig.psds)
@@ -365,7 +365,7 @@ class Watch:
             moved = 0.0
             if self._line_pose is not None:
                 moved = math.dist(pose[:2], self._line_pose[:2]) + self._reach * abs(pose[2] - self._line_pose[2])
-            channel.count(window.mean, began_ns, blocks, self._wander + RELATIVE * moved)
+            channel.count(window.mean, began_ns, blocks, self._allowed_drift + RELATIVE * moved)
 
     def _held_readings(
         self, windows: Sequence[_Window], pose: list[float], off: list[float], began_ns: int, blocks: int
@@ -375,7 +375,7 @@ class Watch:
             if channel.level is None:
                 learned = channel.learn(window.mean)
             else:
-                channel.count(window.mean, began_ns, blocks, self._wander)
+                channel.count(window.mean, began_ns, blocks, self._allowed_drift)
         self._recent.append((began_ns + self._window_ns, pose, off))
         if learned:
             self._known = True

@@ -59,7 +59,7 @@ class HealthReporter:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._observed: CounterSnapshot | None = None
-        self._foretold = Innovations()
+        self._predicted = Innovations()
         self._base = (0, 0, 0, 0)
 
     def report(self, t_ns: int) -> DiagnosticReport:
@@ -194,13 +194,13 @@ class HealthReporter:
         if motion is None:
             return ()
         name = 'psd_deflection: motion'
-        before, self._foretold = self._foretold, motion.innovations
-        new = self._foretold.since(before)
+        before, self._predicted = self._predicted, motion.innovations
+        new = self._predicted.since(before)
         values = [
             *((f'NIS a sample, {axis}', f'{nis:.3f}') for axis, nis in zip(AXES, new.means(), strict=True)),
             ('NIS, 95 % band', '{:.3f} to {:.3f}'.format(*new.band(1.96))),
             ('coasting (s)', f'{motion.coasted:.3f}'),
-            ('times that it coasted', str(motion.coasts)),
+            ('times that it coasted', str(motion.predictions_only)),
             ('base accelerations', str(motion.inertia.count)),
             ('base accelerations, after their samples', str(motion.inertia.late)),
             ('base accelerations, not ended by another', str(motion.inertia.ended)),

@@ -381,20 +381,20 @@ class Recorder:
     def _write(self, bag: BagWriter, take: RecordingJob) -> None:
         items, config = take.queue, take.config
         since_look = 0
-        unwritten = gathered = False
+        unwritten = buffered = False
         while True:
             take.beat = time.monotonic()
             try:
-                item = items.get_nowait() if gathered else items.get(timeout=IDLE_S)
+                item = items.get_nowait() if buffered else items.get(timeout=IDLE_S)
             except queue.Empty:
-                if gathered:
+                if buffered:
                     time.sleep(GATHER_S)
                 elif unwritten:
                     bag.flush()
                     unwritten = False
-                gathered = False
+                buffered = False
                 continue
-            gathered = True
+            buffered = True
             if item is None:
                 return
             if isinstance(item, ParameterChange):

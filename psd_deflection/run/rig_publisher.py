@@ -22,7 +22,7 @@ MEMORY_S = 10.0
 """Time between messages with the pipeline's memory, s; each waits for the end of a segment of the noise."""
 LATE = 100
 """Blocks after which the memory is sent though a segment is under way, if that segment is short."""
-MOST_GATHERED = 20_000
+MOST_BUFFERED = 20_000
 """Numbers of a segment under way that are told; a longer one is waited for."""
 
 
@@ -63,8 +63,8 @@ class RigPublisher:
         due = self._due if self._due is not None else index
         if index < due:
             return
-        gathered = pipeline.gathers
-        if not gathered or (index >= due + LATE and gathered <= MOST_GATHERED):
+        buffered = pipeline.buffers
+        if not buffered or (index >= due + LATE and buffered <= MOST_BUFFERED):
             self._due = index + self._every
             self._untold.append((pipeline.rig, self._memory()._replace(block=index + 1)))
 

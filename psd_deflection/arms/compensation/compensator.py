@@ -464,7 +464,7 @@ class Compensator:
         error = _vector(wanted.inverse() @ self.arm.pose(nominal + self._offsets) @ deflection)[rows]
         jacobian = self.arm.jacobian(nominal + self._offsets)
         in_wanted = np.vstack([wanted.rotation.T @ jacobian[:3], wanted.rotation.T @ jacobian[3:]])[rows]
-        self._verified = (self._verified and not self.response.suspects) or self._observed_to_follow(in_wanted)
+        self._verified = (self._verified and not self.response.candidates) or self._observed_to_follow(in_wanted)
         self._residual = float(np.linalg.norm(self._measured_error(deflection, error)))
         square = in_wanted.T @ in_wanted + settings.damping**2 * np.eye(len(self._offsets))
         step = -np.linalg.solve(square, in_wanted.T @ error) * -math.expm1(-elapsed / settings.time_constant)

@@ -60,7 +60,7 @@ class JointResponse:
         # When a slope was right for the first time.
         self._right_t = math.inf
         # Joints whose last slope was wrong.
-        self.suspects: set[int] = set()
+        self.candidates: set[int] = set()
         self.slopes = np.full(joints, np.nan)
         self.half_widths = np.full(joints, np.nan)
 
@@ -68,14 +68,14 @@ class JointResponse:
         """Forget the slopes: from now on the joints get offsets that begin at ``offsets`` (n,), which they have."""
         self._lagged = np.tile(offsets, (len(LAGS_S), 1))
         self._rows = [(t, joints, self._lagged) for t, joints, _ in self._rows]
-        self.suspects.clear()
+        self.candidates.clear()
         self._right_t = math.inf
         self.slopes, self.half_widths = np.full_like(self.slopes, np.nan), np.full_like(self.slopes, np.nan)
 
     def known(self) -> npt.NDArray[np.bool_]:
         """(n,) bool: whether the slope of each joint was measured, and is right."""
         right = self.half_widths <= KNOWN_WITHIN
-        right[list(self.suspects)] = False
+        right[list(self.candidates)] = False
         return right
 
     def add(self, now: float, joints: FloatArray, offsets: FloatArray, follow_error: float) -> int | None:
@@ -129,7 +129,7 @@ class JointResponse:
         squares = np.maximum((f * f).sum(axis=0), 1e-30)
         slopes = (f * q[:, None]).sum(axis=0) / squares
         residual = np.sqrt(np.square(q[:, None] - slopes * f).mean(axis=0))
-        wrong, suspect = None, False
+        wrong, restarts = None, False
         for j in range(joints.shape[1]):
             step = _step(joints[:, j], follow_error)
             best = int(residual[:, j].argmin())
@@ -147,15 +147,15 @@ class JointResponse:
             before, width = self.slopes[j], self.half_widths[j]
             self.slopes[j], self.half_widths[j] = slope, half_width
             if abs(slope - 1.0) <= LARGEST_ERROR + half_width:
-                self.suspects.discard(j)
+                self.candidates.discard(j)
                 self._right_t = min(self._right_t, self._last_t)
                 continue
-            suspect = True
-            again = j in self.suspects and abs(slope - before) <= half_width + width
+            restarts = True
+            again = j in self.candidates and abs(slope - before) <= half_width + width
             if again or self._last_t - self._right_t < PROVEN_S:
                 wrong = j
-            self.suspects.add(j)
-        if suspect:
+            self.candidates.add(j)
+        if restarts:
             self._restart()
             self._pause_t = self._last_t + PAUSE_S
         return wrong

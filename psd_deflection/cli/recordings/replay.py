@@ -49,7 +49,7 @@ from psd_deflection.recordings.formats.format import Sink
 from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.replay.comparison import ReplayComparison
 from psd_deflection.recordings.replay.engine import (
-    GatheredEstimates,
+    BufferedEstimates,
     open_for_replay,
     part_of,
     replayed,
@@ -272,11 +272,11 @@ def replay_of(
 ) -> Replayed:
     """The task for one of many recordings."""
     recording, rig = open_for_replay(path, params_file, namespace)
-    gathered = GatheredEstimates()
+    buffered = BufferedEstimates()
     part = part_of(recording, span)
     comparison = ReplayComparison(recording, part) if compare else None
-    done = _replayed(recording, rig, params_file, comparison, [gathered.add] if columns else [], part=part)
-    return Replayed(done.summary(), done.warnings, _columns(gathered.series()) if columns else [])
+    done = _replayed(recording, rig, params_file, comparison, [buffered.add] if columns else [], part=part)
+    return Replayed(done.summary(), done.warnings, _columns(buffered.series()) if columns else [])
 
 
 def _columns(series: EstimateSeries) -> list[Column]:
@@ -296,7 +296,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
         if args.out is not None:
             fields = [
                 Field(c.name, int if c.values.dtype.kind == 'i' else float, c.unit)
-                for c in _columns(GatheredEstimates().series())
+                for c in _columns(BufferedEstimates().series())
             ]
             out = stack.enter_context(ParquetFile(args.out, fields))
 

@@ -110,7 +110,7 @@ class BlockTables:
         by = self._by = modes[0].by
         self.size = size
         self._observed = np.empty((len(modes), size, 4))
-        self._walk = np.empty((len(modes), 2, size, size))
+        self._random_walk = np.empty((len(modes), 2, size, size))
         self._to_end = np.empty((len(modes), 2, 4, size))
         self._spread = np.empty((len(modes), 2, 4, 4))
         self.phi = np.stack([mode.step(size * period) for mode in modes])
@@ -122,7 +122,7 @@ class BlockTables:
             for s in range(size):
                 # Covariance of the state at sample s with itself, carried on to later samples.
                 for t in range(s, size):
-                    self._walk[a, :, s, t] = self._walk[a, :, t, s] = by.product(
+                    self._random_walk[a, :, s, t] = self._random_walk[a, :, t, s] = by.product(
                         spreads[s + 1][:, :, 0], steps[t - s][0]
                     )
                 self._to_end[a, :, :, s] = by.product(spreads[s + 1][:, :, 0], steps[size - 1 - s].T)
@@ -133,7 +133,7 @@ class BlockTables:
         ``noise`` (A, N, N): covariance of the readings in one block. ``rates`` (A, K, 2): Q_u
         and Q_r/w^2.
         """
-        self._covariance = noise[:, None] + self._by.einsum('akc,acnm->aknm', rates, self._walk)
+        self._covariance = noise[:, None] + self._by.einsum('akc,acnm->aknm', rates, self._random_walk)
         self._reach = self._by.einsum('akc,acin->akin', rates, self._to_end)
         self.added = self._by.einsum('akc,acij->akij', rates, self._spread)
         self._whole = self._of(np.arange(self.size))

@@ -94,7 +94,7 @@ class ModalFilter:
 
     ``inertia``: takes the accelerations of the base. A late one puts right what was computed of the
     last block. ``innovations``: of the run so far. ``coasted``: s since the last sample that was
-    used. ``coasts``: times that the filter went on without samples. Raises ConfigError if blocks
+    used. ``predictions_only``: times that the filter went on without samples. Raises ConfigError if blocks
     are too long.
     """
 
@@ -133,7 +133,7 @@ class ModalFilter:
         self.levels = 1 if self._stated is not None else STEPPED + SMOOTH
         self._changes = _transitions((1,) if self._stated is not None else (STEPPED, SMOOTH))
         self.innovations = Innovations()
-        self.coasts = 0
+        self.predictions_only = 0
         self._known = KnownLoads(self._modes, self._compliance, size, self._period)
         self.inertia = Inertia(self._modes, rig.link.length)
         self._late_ones = 0
@@ -201,7 +201,7 @@ class ModalFilter:
         forced = self._forced(t_ns)
         self._index, self._t_ns = index, t_ns
         if slots is None or poses is None:
-            self._coast(seconds, forced)
+            self._predict_only(seconds, forced)
             if pushed is not None:
                 self._x = self._x + pushed.end
             if self.coasted > self._longest:
@@ -219,11 +219,11 @@ class ModalFilter:
             return
         self._take_late()
         for k in range(missed):
-            self._coast(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
+            self._predict_only(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
 
-    def _coast(self, seconds: float, forced: Forced | None) -> None:
+    def _predict_only(self, seconds: float, forced: Forced | None) -> None:
         if self.coasted == 0.0:
-            self.coasts += 1
+            self.predictions_only += 1
             self._begin_unseen()
         self.coasted += seconds
         phi = self._tables.phi
@@ -284,20 +284,20 @@ class ModalFilter:
         forced: Forced | None,
     ) -> None:
         gains = self._tables.gains(slots)
-        foretold = self._by.einsum('ani,ai->an', gains.observed, self._x)
+        predicted = self._by.einsum('ani,ai->an', gains.observed, self._x)
         after = self._by.einsum('aij,aj->ai', self._tables.phi, self._x)
         p = self._p + self._unforeseen(self.coasted) if self.coasted > 0.0 else self._p
         if pushed is not None:
-            foretold = foretold + pushed.samples[:, slots]
+            predicted = predicted + pushed.samples[:, slots]
             after = after + pushed.end
             p = p.copy()
             p[:, 2, 2] += pushed.variance
         if forced is not None:
-            foretold = foretold + forced.at[:, slots, 0]
+            predicted = predicted + forced.at[:, slots, 0]
             after = after + forced.at[:, -1]
             p = p.copy()
             p[:, 2, 2] += np.square(forced.doubt)
-        miss = poses.T - foretold
+        miss = poses.T - predicted
         levels = self.levels
         # Of x0, one sample before the block: what the block says, then with what was known.
         scaled = self._by.einsum('aknm,am->akn', gains.precision, miss)
@@ -408,7 +408,7 @@ class ModalFilter:
             arrays = [self._x, self._p, self._shared, self._weights]
             if self._unseen is not None:
                 arrays.append(self._unseen.variances)
-                out[UNSEEN] = (*self._swung.ravel().tolist(), *self._unseen.gathered())
+                out[UNSEEN] = (*self._swung.ravel().tolist(), *self._unseen.buffered())
             out[STATE] = (*times, *held, *_flat(arrays), *waiting)
         elif self._known:
             out[LOADS] = (*held, *waiting)

@@ -58,7 +58,7 @@ class UnseenLoads:
         self._x = np.zeros((spans[-1] + 1, len(modes), 4))
         self._p = np.zeros((spans[-1] + 1, len(modes), 4, 4))
         self._rate = np.zeros((spans[-1] + 1, len(modes), 2))
-        self._gathered = 0
+        self._buffered = 0
 
     def forget(self) -> None:
         """No load was seen."""
@@ -67,17 +67,17 @@ class UnseenLoads:
 
     def begin(self) -> None:
         """Let spans begin at the next block: what is between is not the modes' motion, or is not known to a replay."""
-        self._gathered = 0
+        self._buffered = 0
 
-    def gathered(self) -> tuple[float, ...]:
+    def buffered(self) -> tuple[float, ...]:
         """The states that spans may begin at, the oldest first: mean, covariance and process noise of each block."""
-        count = min(self._gathered, len(self._x))
-        rows = [k % len(self._x) for k in range(self._gathered - count, self._gathered)]
+        count = min(self._buffered, len(self._x))
+        rows = [k % len(self._x) for k in range(self._buffered - count, self._buffered)]
         states = [v for k in rows for array in (self._x, self._p, self._rate) for v in array[k].ravel().tolist()]
         return tuple(states)
 
     def gather(self, values: Sequence[float]) -> bool:
-        """Go on from :meth:`gathered` of another one; False if it does not fit."""
+        """Go on from :meth:`buffered` of another one; False if it does not fit."""
         axes = self.variances.shape[0]
         count, rest = divmod(len(values), 22 * axes)
         if rest or count > len(self._x):
@@ -86,16 +86,16 @@ class UnseenLoads:
         self._x[:count] = states[:, : 4 * axes].reshape(count, axes, 4)
         self._p[:count] = states[:, 4 * axes : 20 * axes].reshape(count, axes, 4, 4)
         self._rate[:count] = states[:, 20 * axes :].reshape(count, axes, 2)
-        self._gathered = count
+        self._buffered = count
         return True
 
     def add(self, x: FloatArray, p: FloatArray, rate: FloatArray) -> None:
         """The state after a block with samples: mean (A, 4), covariance (A, 4, 4), process noise (A, 2)."""
         self.variances *= self._kept
-        there = self._spans[self._spans <= self._gathered]
+        there = self._spans[self._spans <= self._buffered]
         if len(there):
             count = len(there)
-            at = (self._gathered - there) % len(self._x)
+            at = (self._buffered - there) % len(self._x)
             phi = self._phi[:count]
             miss = np.square(x - self._by.einsum('haij,haj->hai', phi, self._x[at]))
             carried = self._by.einsum('haij,hajl->hail', phi, self._p[at])
@@ -104,9 +104,9 @@ class UnseenLoads:
             unforeseen = LARGER**2 * np.maximum(miss / BOUND**2 - expected, 0.0)
             held = self.variances[:, :count]
             np.maximum(held, unforeseen.transpose(1, 0, 2), out=held)
-        here = self._gathered % len(self._x)
+        here = self._buffered % len(self._x)
         self._x[here], self._p[here], self._rate[here] = x, p, rate
-        self._gathered += 1
+        self._buffered += 1
 
     def after(self, seconds: float) -> FloatArray:
         """Variances (A, 4) to add ``seconds`` after the last sample."""

@@ -181,7 +181,7 @@ class StreamNoise:
         return changed
 
     @property
-    def gathered(self) -> int:
+    def buffered(self) -> int:
         """How many numbers :meth:`segment` has."""
         return sum(2 + len(slots) + dots.size for _, slots, dots in self._blocks) + sum(s.size for s in self._sums)
 

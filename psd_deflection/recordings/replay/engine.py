@@ -254,14 +254,14 @@ def replayed_estimates(recording: Recording, rig: Rig) -> EstimateSeries:
     """
     if recording.block_size != rig.estimator.block_size:
         recording = recording.with_block_size(rig.estimator.block_size)
-    gathered = GatheredEstimates()
+    buffered = BufferedEstimates()
     for records in replayed(recording, Pipeline(rig)):
         for record in records:
-            gathered.add(record)
-    return replace(gathered.series(), marks=tuple(recording.marks()))
+            buffered.add(record)
+    return replace(buffered.series(), marks=tuple(recording.marks()))
 
 
-class GatheredEstimates:
+class BufferedEstimates:
     """The primary estimates and tip loads among the records of a replay."""
 
     def __init__(self) -> None:

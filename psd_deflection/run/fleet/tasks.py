@@ -67,14 +67,14 @@ class _Run(Generic[T]):
         self._ended = ended
         self._waiting = deque(range(len(names)))
         self._under_way: dict[Future[Outcome[T]], int] = {}
-        self._suspects: deque[int] = deque()
+        self._to_retry: deque[int] = deque()
         self._ready: dict[int, Outcome[T]] = {}
 
     def outcomes(self) -> Iterator[Outcome[T]]:
         for turn in range(len(self._names)):
             while turn not in self._ready:
-                if self._suspects:
-                    self._try_alone(self._suspects.popleft())
+                if self._to_retry:
+                    self._try_alone(self._to_retry.popleft())
                 else:
                     self._fill(turn)
                     self._gather()
@@ -109,7 +109,7 @@ class _Run(Generic[T]):
                 outcome = self._lost(self._under_way[future], error)
             self._end(self._under_way.pop(future), outcome)
         if broken:
-            self._suspects.extend(sorted(self._under_way.values()))
+            self._to_retry.extend(sorted(self._under_way.values()))
             self._under_way.clear()
             self._engine.renew()
 

@@ -482,11 +482,11 @@ class Acquisition:
                 self._limited_log.log('hello', f'{error}; kept to the first HELLO', WARNING, now / 1e9)
 
     def _enqueue(self, now: int) -> None:
-        gathered = self._buffer
-        if not gathered.seq:
+        buffered = self._buffer
+        if not buffered.seq:
             return
         self._buffer = SampleBuffer()
-        t_ns = self._ros_time_ns(np.array(gathered.t, np.int64))
+        t_ns = self._ros_time_ns(np.array(buffered.t, np.int64))
         # A restarted clock map may give times before the last stamp: time must not go back.
         squeezed = 0
         if t_ns[0] <= self._last_t_ns or bool((t_ns[1:] <= t_ns[:-1]).any()):
@@ -496,7 +496,7 @@ class Acquisition:
         self._note_squeezed(squeezed, now)
         self._last_t_ns = int(t_ns[-1])
         if self.queue.blocks >= self._rig.acquisition.queue_blocks:
-            self.counters.queue_dropped += len(gathered.seq)
+            self.counters.queue_dropped += len(buffered.seq)
             self.counters.dropped_why = self.why_full()
             self._limited_log.log(
                 'full',
@@ -507,12 +507,12 @@ class Acquisition:
             )
             return
         raw = RawChunk(
-            np.array(gathered.seq, np.int64),
+            np.array(buffered.seq, np.int64),
             t_ns,
-            np.array(gathered.readings, np.float32)
+            np.array(buffered.readings, np.float32)
             if self._gate.volts_per_count is None
-            else np.array(gathered.readings, np.int32),
-            np.array(gathered.flags, np.uint8),
+            else np.array(buffered.readings, np.int32),
+            np.array(buffered.flags, np.uint8),
             self._gate.volts_per_count,
         )
         self.queue.put(Arrival(raw, now, self.counters.queue_dropped))

@@ -142,12 +142,12 @@ class Guide:
         return why
 
     def _resting(self, here: FloatArray, filled: float, quiet: float) -> str:
-        wander = float(here.std(axis=0).max())
-        self.progress = filled if wander <= quiet else 0.0
+        moving = float(here.std(axis=0).max())
+        self.progress = filled if moving <= quiet else 0.0
         if filled < 1.0:
             return ''
-        if wander > quiet and self._t < 3.0 * IMPATIENT_S:
-            return self._impatient(f'It still moves by {wander * 1e6:.1f} µm rms: leave it alone.')
+        if moving > quiet and self._t < 3.0 * IMPATIENT_S:
+            return self._impatient(f'It still moves by {moving * 1e6:.1f} µm rms: leave it alone.')
         self._rest_sd = np.maximum(here.std(axis=0), self._noise * np.sqrt(len(here) * self._period / REST_S))
         self._rests.append((self._t, here.mean(axis=0)))
         self._rest_volts = list(self._samples)
@@ -159,8 +159,8 @@ class Guide:
         moved = here.mean(axis=0) - rest
         far = float(np.linalg.norm(moved))
         needed = max(LEAST_PUSH, STAND_OUT * float(np.linalg.norm(self._rest_sd)))
-        wander = float(np.linalg.norm(here.std(axis=0)))
-        held = far > needed and wander < STEADY * far
+        moving = float(np.linalg.norm(here.std(axis=0)))
+        held = far > needed and moving < STEADY * far
         self.progress = filled if held else 0.0
         if max(float(np.abs(v[:, DOT_CHANNELS]).max()) for v in self._samples) >= self._rail:
             return self._impatient('A dot is at the end of its PSD: push less.')
@@ -177,8 +177,8 @@ class Guide:
     def _released(self, here: FloatArray, filled: float) -> str:
         push = float(np.linalg.norm(self._held - self._rests[-1][1]))
         back = float(np.linalg.norm(here.mean(axis=0) - self._rests[-1][1]))
-        wander = float(np.linalg.norm(here.std(axis=0)))
-        free = back < LET_GO * push and wander < LET_GO * push
+        moving = float(np.linalg.norm(here.std(axis=0)))
+        free = back < LET_GO * push and moving < LET_GO * push
         self.progress = filled if free else 0.0
         if not free or filled < 1.0:
             return self._impatient('Let go of the link.') if not free else ''

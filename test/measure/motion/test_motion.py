@@ -57,15 +57,15 @@ def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion
         assert axis.velocity < 1.1 * axis.own
         # What is told of a base is a mean over some samples.
         assert (0.90 if kind == 'joint' else 0.92) < axis.inside < 0.98
-        assert axis.foretold < 0.5 * axis.held
+        assert axis.predicted < 0.5 * axis.held
 
 
 @pytest.mark.slow
 def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(judged: dict[str, motion.Result]) -> None:
     swept = judged['chirp']
     # The frequency rises with time, from 0.5 Hz to 1.2 times that of the mode.
-    for foretold, held in zip(np.array_split(swept.foretold, 8), np.array_split(swept.held, 8), strict=True):
-        assert np.all(np.square(foretold).mean(axis=0) < 0.9 * np.square(held).mean(axis=0))
+    for predicted, held in zip(np.array_split(swept.predicted, 8), np.array_split(swept.held, 8), strict=True):
+        assert np.all(np.square(predicted).mean(axis=0) < 0.9 * np.square(held).mean(axis=0))
 
 
 @pytest.mark.slow
@@ -89,14 +89,14 @@ def test_without_samples_for_100_ms_the_truth_is_within_three_deviations(operati
     assert filtered is not None
     for first in range(160, 380, 20):
         before = through(pipeline, operation, range(0 if first == 160 else first - 20, first))[-1]
-        foretold = filtered.predicted(np.arange(1.0, 101.0) / 1000.0)
+        predicted = filtered.predicted(np.arange(1.0, 101.0) / 1000.0)
         ahead = slice(20 * first, 20 * first + 100)
-        beyond.append(np.abs(foretold.pose - operation.pose[ahead]) / np.sqrt(foretold.variance))
-        assert foretold.variance[-1, 0] > 4.0 * foretold.variance[0, 0]
+        beyond.append(np.abs(predicted.pose - operation.pose[ahead]) / np.sqrt(predicted.variance))
+        assert predicted.variance[-1, 0] > 4.0 * predicted.variance[0, 0]
     assert np.mean(np.concatenate(beyond) < 3.0) > 0.99
     # Samples come back: the filter goes on, and does not begin anew.
     after = through(pipeline, operation, range(first + 5, first + 6))[-1]
-    assert filtered.coasts == 1
+    assert filtered.predictions_only == 1
     assert np.all(np.abs(pose(after) - truth(operation, after)) < 5.0 * np.sqrt(after.covariance[::4]))
     assert after.covariance[0] < 100.0 * before.covariance[0]
 
@@ -157,10 +157,10 @@ def test_ahead_is_the_prediction(operation: motion.Run) -> None:
     here = through(now, operation, range(250))[-1]
     assert there.t_ns == here.t_ns + 5_000_000
     assert now.motion_filter is not None
-    foretold = now.motion_filter.predicted(np.array([0.005]))
-    np.testing.assert_allclose(pose(there), foretold.pose[0], rtol=1e-9)
-    np.testing.assert_allclose(velocity(there), foretold.velocity[0], rtol=1e-9)
-    np.testing.assert_allclose(there.covariance[::4], foretold.variance[0], rtol=1e-9)
+    predicted = now.motion_filter.predicted(np.array([0.005]))
+    np.testing.assert_allclose(pose(there), predicted.pose[0], rtol=1e-9)
+    np.testing.assert_allclose(velocity(there), predicted.velocity[0], rtol=1e-9)
+    np.testing.assert_allclose(there.covariance[::4], predicted.variance[0], rtol=1e-9)
     assert np.all(np.abs(pose(there) - truth(operation, there)) < 4.0 * np.sqrt(there.covariance[::4]))
 
 
@@ -226,7 +226,7 @@ def test_a_restart_begins_anew(operation: motion.Run) -> None:
     later = RawChunk(late.seq + 20, late.t_ns + 300_000_000, late.readings, late.flags)
     found = [r for r in pipeline.process(later) if isinstance(r, TipMotion)][-1]
     assert pipeline.motion_filter is not None
-    assert pipeline.motion_filter.coasts == 0
+    assert pipeline.motion_filter.predictions_only == 0
     assert np.all(np.abs(pose(found) - operation.pose[4019]) < 5.0 * np.sqrt(found.covariance[::4]))
 
 
