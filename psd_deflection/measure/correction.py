@@ -82,7 +82,7 @@ class Correction:
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         self._nominal, self._true = Physics.of(rig), Physics.of(rig)
-        self._by = self._nominal.by = self._true.by = FIXED
+        self._xp = self._nominal.xp = self._true.xp = FIXED
         # The solvers take every beam as parallel to Z.
         self._nominal.slopes = np.zeros_like(self._nominal.slopes)
         self._psds = len(rig.psds)
@@ -134,7 +134,7 @@ class Correction:
             self._beams.append(active)
         if effect.correct is not None:
             sums = np.full((self._psds, 2), self._nominal.sum_nominal)
-            effect.correct(Reading(np.full((2 * self._psds, 2), 1e-3), sums, warmer, t, self._by), active.values)
+            effect.correct(Reading(np.full((2 * self._psds, 2), 1e-3), sums, warmer, t, self._xp), active.values)
             self._sensors.insert(0, (effect.correct, active.values))
         moves = effect.point == 'beam' or _optics(self._true) != before
         if moves and self._nominal.psds_at_base:
@@ -172,7 +172,7 @@ class Correction:
             given,
             np.broadcast_to(np.asarray(warmer, dtype=np.float64), (n,)),
             np.broadcast_to(np.asarray(t, dtype=np.float64), (n,)),
-            self._by,
+            self._xp,
         )
         for correct, values in self._sensors:
             correct(reading, values)
@@ -196,4 +196,4 @@ def _optics(physics: Physics) -> list[object]:
 def _flat_pose(dots: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
     """Pose (3, n) of a flat plate from dots (2P, n)."""
     n = dots.shape[1]
-    return flat_poses(dots.T.reshape(n, -1, 2) + physics.centers, beams.T.reshape(n, -1, 2), physics.by).T
+    return flat_poses(dots.T.reshape(n, -1, 2) + physics.centers, beams.T.reshape(n, -1, 2), physics.xp).T

@@ -144,7 +144,7 @@ class Estimation:
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         config = rig.estimator
-        self._by = FIXED
+        self._xp = FIXED
         variances = dot_noise_variances(rig)
         self.variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self.zero_variances: tuple[float, ...] = ()
@@ -208,9 +208,9 @@ class Estimation:
         gain = self.gain_at_rest()
         pose, rate = np.zeros((3, 3)), np.zeros((3, 3))
         for tone in self.estimator.noise.tones:
-            own = self._by.einsum('ic,cd,jd->ij', gain, tone.covariance, gain)
+            own = self._xp.einsum('ic,cd,jd->ij', gain, tone.covariance, gain)
             pose += own
-            rate += self._by.square(2.0 * pi * tone.frequency * self._rig.converter.sample_rate_hz) * own
+            rate += self._xp.square(2.0 * pi * tone.frequency * self._rig.converter.sample_rate_hz) * own
         return pose, rate
 
     def zero_noise(self, size: int) -> tuple[float, ...]:
@@ -284,7 +284,7 @@ class Estimation:
         factor = None if self.spread is None else self.spread.factor(solution.dx, solution.dy, solution.theta)
         covariance = readings.covariance
         if factor is not None:
-            covariance = covariance + self._by.einsum('ik,jk->ij', factor, factor)
+            covariance = covariance + self._xp.einsum('ik,jk->ij', factor, factor)
         return SolvedReadings(readings, solution, '', factor, self._unexplained(readings, solution, covariance))
 
     def _unexplained(self, readings: BlockReadings, solution: Solution, covariance: FloatArray) -> Unexplained | None:
@@ -388,7 +388,7 @@ class Estimation:
         gains = [self._gain(number, s, readings) for number, s in answers]
         known = np.array([gain for gain in gains if gain is not None])
         # Of all solvers at once: of so few numbers the calls cost most.
-        noises = iter(self._by.einsum('sic,ck,sjk->sij', known, readings.covariance, known) if len(known) else ())
+        noises = iter(self._xp.einsum('sic,ck,sjk->sij', known, readings.covariance, known) if len(known) else ())
         out = []
         for (number, s), gain in zip(answers, gains, strict=True):
             covariance: tuple[float, ...] = s.covariance
@@ -416,7 +416,7 @@ class Estimation:
             phi=s.phi,
             omega=s.omega,
             covariance=covariance,
-            residual_rms=self._by.root(self._by.total([r * r for r in s.residual]) / len(s.residual)),
+            residual_rms=self._xp.root(self._xp.total([r * r for r in s.residual]) / len(s.residual)),
             primary=primary,
             chi_square=checked.chi_square if primary and checked is not None and checked.freedom else nan,
             on_own_topic=block.due,
@@ -438,9 +438,9 @@ class Estimation:
             noise = noise + allowance
         own = noise
         if used.factor is not None:
-            own = own + _through(gain, used.factor, self._by)
+            own = own + _through(gain, used.factor, self._xp)
         if checked is not None and self._rig.estimator.consistency == 'widen' and any(checked.possible):
-            own = widened(own, gain, checked.possible, self._by)
+            own = widened(own, gain, checked.possible, self._xp)
         if number == 0 and own is not noise:
             self.systematic = own - noise
         return tuple(own.ravel().tolist())
@@ -466,8 +466,8 @@ class Estimation:
     def _from_one(self, psd: int, block: ValidBlock, variances: tuple[float, ...]) -> DeflectionEstimate | None:
         """The translation from the remaining detector ``psd`` (from 0), by the rule that ``degraded`` names."""
         config = self._rig.estimator
-        by = self._by
-        theta, variance = 0.0, by.square(config.twist_sd)
+        xp = self._xp
+        theta, variance = 0.0, xp.square(config.twist_sd)
         if config.degraded == 'none':
             return None
         if config.degraded == 'hold':
@@ -476,15 +476,15 @@ class Estimation:
                 return None
             age = max(block.t_ns - held.t_ns, 0) / 1e9
             theta = held.theta
-            variance = held.variance + by.square(config.twist_sd) * -by.expm1(-age / config.twist_hold)
+            variance = held.variance + xp.square(config.twist_sd) * -xp.expm1(-age / config.twist_hold)
         x, y = block.means[2 * psd : 2 * psd + 2]
         vx, vy = variances[2 * psd : 2 * psd + 2]
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
         if self.spread is not None:
             gain = np.zeros((3, 2 * len(self._rig.psds)))
-            c, s = by.cos_sin(theta)
+            c, s = xp.cos_sin(theta)
             gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
-            own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta), by)
+            own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta), xp)
             cov = tuple(own.ravel().tolist())
         return DeflectionEstimate(
             t_ns=block.t_ns,
@@ -502,7 +502,7 @@ class Estimation:
         )
 
 
-def _through(gain: FloatArray, factor: FloatArray, by: Arithmetic) -> FloatArray:
+def _through(gain: FloatArray, factor: FloatArray, xp: Arithmetic) -> FloatArray:
     """Return (K F)(K F)^T (3, 3) for ``gain`` K (3, C) and ``factor`` F (C, k) m."""
-    moved = by.einsum('ij,jk->ik', gain, factor)
-    return by.einsum('ik,jk->ij', moved, moved)
+    moved = xp.einsum('ij,jk->ik', gain, factor)
+    return xp.einsum('ik,jk->ij', moved, moved)

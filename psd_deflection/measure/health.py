@@ -144,7 +144,7 @@ class OpticsHealth:
 
     def __init__(self, rig: Rig) -> None:
         config = rig.estimator
-        self._by = FIXED
+        self._xp = FIXED
         self._psds = len(rig.psds)
         self._size = config.block_size
         self._min_samples = min(config.min_samples, config.block_size)
@@ -283,7 +283,7 @@ class OpticsHealth:
         for psd in range(self._psds):
             total = sums[psd]
             share = max(total - self._nominal, 0.0) / total if total > self._sum_max else 0.0
-            out.append(self._by.square(share * max(self._half[2 * psd : 2 * psd + 2])) / 3.0)
+            out.append(self._xp.square(share * max(self._half[2 * psd : 2 * psd + 2])) / 3.0)
         return tuple(out)
 
 

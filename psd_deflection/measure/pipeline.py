@@ -100,7 +100,7 @@ class Pipeline:
         self.last_estimate: DeflectionEstimate | None = None
         self.last_spots: SpotMeans | None = None
         config = rig.estimator
-        self._by = FIXED
+        self._xp = FIXED
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self.zero_rejected = ''
@@ -197,7 +197,7 @@ class Pipeline:
         self.zero_rejected = why_moving(recent, noise)
         if self.zero_rejected:
             return None
-        means = [self._by.total(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
+        means = [self._xp.total(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
         values: dict[str, float | str | tuple[float, ...]] = dict(
             zip(ZEROS, zip(means[0::2], means[1::2], strict=True), strict=False)
         )

@@ -28,15 +28,15 @@ class RecordedVibration:
     def __init__(self, rig: Rig) -> None:
         self._rate = rig.converter.sample_rate_hz
         self._size = rig.estimator.block_size
-        by = FIXED
-        self._by = by
+        xp = FIXED
+        self._xp = xp
         self._calibration = VoltsToDots.from_rig(rig)
-        self._combinations = combinations_of(rig.centers, rig.centers + rig.zeros, by=by)
+        self._combinations = combinations_of(rig.centers, rig.centers + rig.zeros, xp=xp)
         self._turn = self._combinations.turn[: self._combinations.moving]
         self._light = rig.estimator.sum_min
         self._volt = rig.sensitivities.mean(axis=1)
         self._channels = 3 * len(rig.psds)
-        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, by)
+        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, xp)
         self._segment = -1
         self._samples: list[tuple[IntArray, FloatArray, FloatArray]] = []
         self._loudest: Tone | None = None
@@ -73,7 +73,7 @@ class RecordedVibration:
         if sum(len(places) for places, _, _ in samples) < _LEAST_SHARE * SEGMENT_BLOCKS * self._size:
             return
         places, dots, sums = (np.concatenate(part) for part in zip(*samples, strict=True))
-        moving = self._by.einsum('sc,ac->sa', dots, self._turn)
+        moving = self._xp.einsum('sc,ac->sa', dots, self._turn)
         still = np.column_stack((self._combinations.fixed(dots), sums))
         tones = self._search.tones(places, moving, still, self._turn)
         self.seconds += 1

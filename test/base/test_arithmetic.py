@@ -96,14 +96,14 @@ def test_floats_and_arrays_have_the_same_bits(x: float, y: float) -> None:
     assert FIXED.power_many(a, 3)[0] == FIXED.power(x, 3)
 
 
-@pytest.mark.parametrize('by', [LIBRARY, FIXED])
-def test_powers_and_roots(by: Arithmetic) -> None:
+@pytest.mark.parametrize('xp', [LIBRARY, FIXED])
+def test_powers_and_roots(xp: Arithmetic) -> None:
     x = np.linspace(-2.0, 2.0, 9)
     for n in range(5):
-        assert by.power_many(x, n) == pytest.approx(x**n)
-    assert by.power_many(10.0, np.arange(4)) == pytest.approx(np.array([1.0, 10.0, 100.0, 1000.0]))
-    assert (by.power(3.0, 4), by.square(-3.0), by.root(2.25)) == (81.0, 9.0, 1.5)
-    assert by.total(v for v in (1.0, 2.0, 3.5)) == 6.5
+        assert xp.power_many(x, n) == pytest.approx(x**n)
+    assert xp.power_many(10.0, np.arange(4)) == pytest.approx(np.array([1.0, 10.0, 100.0, 1000.0]))
+    assert (xp.power(3.0, 4), xp.square(-3.0), xp.root(2.25)) == (81.0, 9.0, 1.5)
+    assert xp.total(v for v in (1.0, 2.0, 3.5)) == 6.5
 
 
 SPECS = (
@@ -181,21 +181,21 @@ def test_matrices_are_solved_as_lapack_solves_them(size: int) -> None:
     a, b = rng.normal(size=(size, size)), rng.normal(size=(size, 4))
     square = a @ a.T + 0.1 * np.eye(size)
     scale = 1e-13 * np.linalg.cond(a)
-    for by in (LIBRARY, FIXED):
-        assert by.solve(a, b) == pytest.approx(np.linalg.solve(a, b), rel=scale, abs=scale)
-        assert by.solve(a, b[:, 0]) == pytest.approx(np.linalg.solve(a, b[:, 0]), rel=scale, abs=scale)
-        assert by.product(by.inverse_of(square), square) == pytest.approx(np.eye(size), abs=1e-9)
-        assert by.log_det(square[None])[0] == pytest.approx(np.linalg.slogdet(square)[1], abs=1e-12)
-        assert by.log_det_by_pivots(square[None])[0] == pytest.approx(np.linalg.slogdet(square)[1], abs=1e-12)
-        values, vectors = by.eigen(square)
+    for xp in (LIBRARY, FIXED):
+        assert xp.solve(a, b) == pytest.approx(np.linalg.solve(a, b), rel=scale, abs=scale)
+        assert xp.solve(a, b[:, 0]) == pytest.approx(np.linalg.solve(a, b[:, 0]), rel=scale, abs=scale)
+        assert xp.product(xp.inverse_of(square), square) == pytest.approx(np.eye(size), abs=1e-9)
+        assert xp.log_det(square[None])[0] == pytest.approx(np.linalg.slogdet(square)[1], abs=1e-12)
+        assert xp.log_det_by_pivots(square[None])[0] == pytest.approx(np.linalg.slogdet(square)[1], abs=1e-12)
+        values, vectors = xp.eigen(square)
         assert values == pytest.approx(np.linalg.eigvalsh(square), rel=1e-12, abs=1e-12 * values[-1])
         assert (vectors * values) @ vectors.T == pytest.approx(square, abs=1e-12 * values[-1])
-        assert by.is_positive(square)
-        assert not by.is_positive(square - 1.01 * values[0] * np.eye(size))
+        assert xp.is_positive(square)
+        assert not xp.is_positive(square - 1.01 * values[0] * np.eye(size))
         tall = rng.normal(size=(2 * size + 3, size))
-        assert by.pseudo_inverse(tall) == pytest.approx(np.linalg.pinv(tall), abs=1e-12)
+        assert xp.pseudo_inverse(tall) == pytest.approx(np.linalg.pinv(tall), abs=1e-12)
         wanted = rng.normal(size=(len(tall), 2))
-        assert by.least_squares(tall, wanted) == pytest.approx(np.linalg.lstsq(tall, wanted, rcond=None)[0], abs=1e-12)
+        assert xp.least_squares(tall, wanted) == pytest.approx(np.linalg.lstsq(tall, wanted, rcond=None)[0], abs=1e-12)
 
 
 def test_many_small_matrices_are_solved_at_once_with_any_pivot() -> None:
@@ -317,11 +317,11 @@ def processor_dependent(tree: ast.AST) -> list[tuple[int, str]]:
             found.append((node.lineno, f'.{node.func.attr}()'))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ('sum', 'dot'):
             owner = node.func.value
-            by = isinstance(owner, ast.Name) and owner.id in ('by', 'arithmetic')
-            by |= isinstance(owner, ast.Attribute) and owner.attr in ('_by', 'by', '_arithmetic')
+            xp = isinstance(owner, ast.Name) and owner.id in ('xp', 'arithmetic')
+            xp |= isinstance(owner, ast.Attribute) and owner.attr in ('_xp', 'xp')
             # Truths that are counted have no order.
             counted = isinstance(owner, ast.Name) and owner.id == 'keep'
-            if not by and not counted:
+            if not xp and not counted:
                 found.append((node.lineno, '.sum()'))
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and not isinstance(node.right, ast.Constant):
             found.append((node.lineno, 'a ** b'))

@@ -61,7 +61,7 @@ class Inertia:
         """``modes``: of dX, dY, theta. ``length``: L, m."""
         self._modes = modes
         self._length = length
-        self._gives = np.array([-1.0 / mode.by.square(mode.w) for mode in modes])
+        self._gives = np.array([-1.0 / mode.xp.square(mode.w) for mode in modes])
         self.reported: list[tuple[int, tuple[float, ...]]] = []
         self.ended = 0
         self.late = 0
@@ -154,5 +154,5 @@ class Inertia:
         at = np.zeros((3, len(seconds), 4))
         for a, mode in enumerate(self._modes):
             pushed = mode.pushed(times)[:, 0, :2].reshape(len(seconds), len(since), 2)
-            at[a, :, :2] = mode.by.einsum('nsc,s->nc', pushed, np.array(sizes)[:, a])
+            at[a, :, :2] = mode.xp.einsum('nsc,s->nc', pushed, np.array(sizes)[:, a])
         return Forced(at, doubt)

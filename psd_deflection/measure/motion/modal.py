@@ -30,11 +30,11 @@ from psd_deflection.records import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Oscillator:
-    """One mode. ``frequency`` Hz, undamped, above 0; ``damping_ratio`` 0 or more, below 1; ``by``: what computes it."""
+    """One mode. ``frequency`` Hz, undamped, above 0; ``damping_ratio`` 0 or more, below 1; ``xp``: what computes it."""
 
     frequency: float
     damping_ratio: float
-    by: Arithmetic = FIXED
+    xp: Arithmetic = FIXED
 
     @property
     def w(self) -> float:
@@ -43,10 +43,10 @@ class Oscillator:
 
     def step(self, seconds: float) -> FloatArray:
         """Phi (4, 4): the state after ``seconds`` of its own motion."""
-        w, zeta, by = self.w, self.damping_ratio, self.by
-        root = math.sqrt(1.0 - by.square(zeta))
-        decay = by.exp(-zeta * w * seconds)
-        c, s = by.cos(root * w * seconds), by.sin(root * w * seconds) / root
+        w, zeta, xp = self.w, self.damping_ratio, self.xp
+        root = math.sqrt(1.0 - xp.square(zeta))
+        decay = xp.exp(-zeta * w * seconds)
+        c, s = xp.cos(root * w * seconds), xp.sin(root * w * seconds) / root
         kept, turned = decay * (c + zeta * s), decay * s
         out = np.zeros((4, 4))
         out[:2, :2] = [[kept, turned], [-turned, decay * (c - zeta * s)]]
@@ -55,14 +55,14 @@ class Oscillator:
 
     def pushed(self, seconds: FloatArray) -> FloatArray:
         """(n, 2, 4): the state ``seconds`` (n,) after u, or r/w, went from 0 to 1: columns of Phi; 0 before that."""
-        w, zeta, by = self.w, self.damping_ratio, self.by
-        root = math.sqrt(1.0 - by.square(zeta))
+        w, zeta, xp = self.w, self.damping_ratio, self.xp
+        root = math.sqrt(1.0 - xp.square(zeta))
         since = np.maximum(seconds, 0.0)
-        decay = by.exp_many(-zeta * w * since)
-        c, s = by.cos_many(root * w * since), by.sin_many(root * w * since) / root
+        decay = xp.exp_many(-zeta * w * since)
+        c, s = xp.cos_many(root * w * since), xp.sin_many(root * w * since) / root
         zero, one = np.zeros(len(since)), np.ones(len(since))
         rest = 1.0 - decay * (c + zeta * s)
-        lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * by.square(zeta) - 1.0) * s)
+        lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * xp.square(zeta) - 1.0) * s)
         out = np.array([[rest, decay * s, one, zero], [w * since - lag, rest, w * since, one]]).transpose(2, 0, 1)
         return np.asarray(np.where(seconds[:, None, None] >= 0.0, out, 0.0))
 
@@ -72,12 +72,12 @@ class Oscillator:
         It is the integral of the column of Phi times itself, by Gauss-Legendre in pieces of an eighth of a
         period at most.
         """
-        nodes, weights = self.by.legendre(8)
+        nodes, weights = self.xp.legendre(8)
         pieces = max(1, math.ceil(8.0 * float(seconds.max()) * self.frequency))
         shares = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1.0)) / pieces).ravel()
         pushed = self.pushed((seconds[:, None] * shares).ravel()).reshape(len(seconds), len(shares), 2, 4)
         parts = np.tile(0.5 * weights / pieces, pieces) * seconds[:, None]
-        return self.by.einsum('np,npci,npcj->ncij', parts, pushed, pushed)
+        return self.xp.einsum('np,npci,npcj->ncij', parts, pushed, pushed)
 
 
 class BlockGains(NamedTuple):
@@ -107,7 +107,7 @@ class BlockTables:
 
     def __init__(self, modes: tuple[Oscillator, ...], size: int, period: float) -> None:
         """``size``: N. ``period``: of a sample, s."""
-        by = self._by = modes[0].by
+        xp = self._xp = modes[0].xp
         self.size = size
         self._observed = np.empty((len(modes), size, 4))
         self._random_walk = np.empty((len(modes), 2, size, size))
@@ -122,10 +122,10 @@ class BlockTables:
             for s in range(size):
                 # Covariance of the state at sample s with itself, carried on to later samples.
                 for t in range(s, size):
-                    self._random_walk[a, :, s, t] = self._random_walk[a, :, t, s] = by.product(
+                    self._random_walk[a, :, s, t] = self._random_walk[a, :, t, s] = xp.product(
                         spreads[s + 1][:, :, 0], steps[t - s][0]
                     )
-                self._to_end[a, :, :, s] = by.product(spreads[s + 1][:, :, 0], steps[size - 1 - s].T)
+                self._to_end[a, :, :, s] = xp.product(spreads[s + 1][:, :, 0], steps[size - 1 - s].T)
 
     def fill(self, noise: FloatArray, rates: FloatArray) -> None:
         """Use this noise and these rates.
@@ -133,9 +133,9 @@ class BlockTables:
         ``noise`` (A, N, N): covariance of the readings in one block. ``rates`` (A, K, 2): Q_u
         and Q_r/w^2.
         """
-        self._covariance = noise[:, None] + self._by.einsum('akc,acnm->aknm', rates, self._random_walk)
-        self._reach = self._by.einsum('akc,acin->akin', rates, self._to_end)
-        self.added = self._by.einsum('akc,acij->akij', rates, self._spread)
+        self._covariance = noise[:, None] + self._xp.einsum('akc,acnm->aknm', rates, self._random_walk)
+        self._reach = self._xp.einsum('akc,acin->akin', rates, self._to_end)
+        self.added = self._xp.einsum('akc,acij->akij', rates, self._spread)
         self._whole = self._of(np.arange(self.size))
 
     def gains(self, slots: IntArray) -> BlockGains:
@@ -148,16 +148,16 @@ class BlockTables:
         precision = inverse(covariance.reshape(-1, count, count)).reshape(covariance.shape)
         observed = self._observed[:, slots]
         reach = self._reach[..., slots]
-        pulled = self._by.einsum('ani,aknm->akim', observed, precision)
-        smoothed = self._by.einsum('akin,aknm->akim', reach, precision)
-        size = self._by.log_det(covariance)
+        pulled = self._xp.einsum('ani,aknm->akim', observed, precision)
+        smoothed = self._xp.einsum('akin,aknm->akim', reach, precision)
+        size = self._xp.log_det(covariance)
         return BlockGains(
             observed,
             precision,
             pulled,
             smoothed,
-            self._by.einsum('akin,anj->akij', pulled, observed),
-            self.phi[:, None] - self._by.einsum('akin,anj->akij', smoothed, observed),
-            self.added - self._by.einsum('akin,akjn->akij', smoothed, reach),
+            self._xp.einsum('akin,anj->akij', pulled, observed),
+            self.phi[:, None] - self._xp.einsum('akin,anj->akij', smoothed, observed),
+            self.added - self._xp.einsum('akin,akjn->akij', smoothed, reach),
             size,
         )

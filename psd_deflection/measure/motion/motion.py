@@ -109,9 +109,9 @@ class ModalFilter:
             raise ConfigError(f'filter = {config.filter}: needs a block_size of {LARGEST} at most, not {size}')
         self._size = size
         self._period = 1.0 / rig.converter.sample_rate_hz
-        by = self._by = FIXED
-        bending = Oscillator(dynamics.bending_frequency, dynamics.bending_damping_ratio, by)
-        torsion = Oscillator(dynamics.torsion_frequency, dynamics.torsion_damping_ratio, by)
+        xp = self._xp = FIXED
+        bending = Oscillator(dynamics.bending_frequency, dynamics.bending_damping_ratio, xp)
+        torsion = Oscillator(dynamics.torsion_frequency, dynamics.torsion_damping_ratio, xp)
         self._modes = (bending, bending, torsion)
         self._w = np.array([mode.w for mode in self._modes])
         self._tables = BlockTables(self._modes, size, self._period)
@@ -160,7 +160,7 @@ class ModalFilter:
 
     def set_noise(self, gamma: FloatArray) -> None:
         """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
-        turned = self._by.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
+        turned = self._xp.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
         lags = np.arange(self._size)[:, None] - np.arange(self._size)
         behind = np.where(lags >= 0, turned.transpose(1, 0, 2)[..., np.abs(lags)], turned[..., np.abs(lags)])
         own = behind[range(3), range(3)]
@@ -169,8 +169,8 @@ class ModalFilter:
         if rates is None:
             seconds = self._size * self._period
             rates = np.zeros((3, self.levels, 2))
-            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._by.power_many(STEP, np.arange(STEPPED)))
-            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._by.power_many(STEP, np.arange(SMOOTH)))
+            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._xp.power_many(STEP, np.arange(STEPPED)))
+            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._xp.power_many(STEP, np.arange(SMOOTH)))
             rates[:, :STEPPED, 0] = steps
             rates[:, STEPPED:, 1] = smooth / (self._w[:, None] * seconds) ** 2
         self._rates = rates
@@ -227,10 +227,10 @@ class ModalFilter:
             self._begin_unseen()
         self.coasted += seconds
         phi = self._tables.phi
-        self._x = self._by.einsum('aij,aj->ai', phi, self._x)
-        added = self._by.einsum('ak,akij->aij', self._weights, self._tables.added)
-        self._p = self._by.einsum('aij,ajl,aml->aim', phi, self._p, phi) + added
-        self._shared = self._by.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
+        self._x = self._xp.einsum('aij,aj->ai', phi, self._x)
+        added = self._xp.einsum('ak,akij->aij', self._weights, self._tables.added)
+        self._p = self._xp.einsum('aij,ajl,aml->aim', phi, self._p, phi) + added
+        self._shared = self._xp.einsum('pij,pjl,pml->pim', phi[_FIRST], self._shared, phi[_SECOND])
         self._taken = None
         if forced is not None:
             self._x = self._x + forced.at[:, -1]
@@ -266,13 +266,13 @@ class ModalFilter:
         """
         came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late
         taken = self._taken
-        kept = self._by.exp(-self._size * self._period / LATE_S)
+        kept = self._xp.exp(-self._size * self._period / LATE_S)
         self._late = kept * self._late if taken is not None else np.zeros((3, 2))
         if taken is None or not came or (now := self._forced(self._t_ns)) is None:
             return
         more = now.at - taken.forced.at
         self._late += (1.0 - kept) * np.square(more[:, -1, :2])
-        self._x = self._x + more[:, -1] - self._by.einsum('ain,an->ai', taken.gain, more[..., 0])
+        self._x = self._x + more[:, -1] - self._xp.einsum('ain,an->ai', taken.gain, more[..., 0])
         self._swung = self._swung + more[:, -1]
         self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
 
@@ -284,8 +284,8 @@ class ModalFilter:
         forced: Forced | None,
     ) -> None:
         gains = self._tables.gains(slots)
-        predicted = self._by.einsum('ani,ai->an', gains.observed, self._x)
-        after = self._by.einsum('aij,aj->ai', self._tables.phi, self._x)
+        predicted = self._xp.einsum('ani,ai->an', gains.observed, self._x)
+        after = self._xp.einsum('aij,aj->ai', self._tables.phi, self._x)
         p = self._p + self._unforeseen(self.coasted) if self.coasted > 0.0 else self._p
         if pushed is not None:
             predicted = predicted + pushed.samples[:, slots]
@@ -300,34 +300,34 @@ class ModalFilter:
         miss = poses.T - predicted
         levels = self.levels
         # Of x0, one sample before the block: what the block says, then with what was known.
-        scaled = self._by.einsum('aknm,am->akn', gains.precision, miss)
-        score = self._by.einsum('akin,an->aki', gains.pulled, miss)
+        scaled = self._xp.einsum('aknm,am->akn', gains.precision, miss)
+        score = self._xp.einsum('akin,an->aki', gains.pulled, miss)
         known = inverse(p)
         posterior = inverse((known[:, None] + gains.information).reshape(-1, 4, 4)).reshape(3, levels, 4, 4)
-        squares = self._by.einsum('an,akn->ak', miss, scaled) - self._by.einsum(
+        squares = self._xp.einsum('an,akn->ak', miss, scaled) - self._xp.einsum(
             'aki,akij,akj->ak', score, posterior, score
         )
-        size = gains.log_size - self._by.log_det_by_pivots(posterior) + self._by.log_det_by_pivots(p)[:, None]
-        prior = self._by.einsum('ak,kl->al', self._weights, self._changes)
-        log_weights = self._by.log_many(prior) - 0.5 * (size + squares)
-        weights = self._by.exp_many(log_weights - log_weights.max(axis=1, keepdims=True))
-        weights /= self._by.sum(weights, 1)[:, None]
-        carried = self._by.einsum('akij,akjl->akil', gains.kept, posterior)
-        found = after[:, None] + self._by.einsum('akin,an->aki', gains.smoothed, miss)
-        found += self._by.einsum('akij,akj->aki', carried, score)
-        covariance = self._by.einsum('akij,aklj->akil', carried, gains.kept) + gains.left
-        self._x = self._by.einsum('ak,aki->ai', weights, found)
+        size = gains.log_size - self._xp.log_det_by_pivots(posterior) + self._xp.log_det_by_pivots(p)[:, None]
+        prior = self._xp.einsum('ak,kl->al', self._weights, self._changes)
+        log_weights = self._xp.log_many(prior) - 0.5 * (size + squares)
+        weights = self._xp.exp_many(log_weights - log_weights.max(axis=1, keepdims=True))
+        weights /= self._xp.sum(weights, 1)[:, None]
+        carried = self._xp.einsum('akij,akjl->akil', gains.kept, posterior)
+        found = after[:, None] + self._xp.einsum('akin,an->aki', gains.smoothed, miss)
+        found += self._xp.einsum('akij,akj->aki', carried, score)
+        covariance = self._xp.einsum('akij,aklj->akil', carried, gains.kept) + gains.left
+        self._x = self._xp.einsum('ak,aki->ai', weights, found)
         apart = found - self._x[:, None]
         spread = covariance + apart[..., :, None] * apart[..., None, :]
-        self._p = self._by.einsum('ak,akij->aij', weights, spread)
+        self._p = self._xp.einsum('ak,akij->aij', weights, spread)
         self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
-        mean = self._by.einsum('ak,akin->ain', weights, gains.smoothed)
-        mean += self._by.einsum('akij,akjn->ain', weights[..., None, None] * carried, gains.pulled)
-        own = self._tables.phi - self._by.einsum('ain,anj->aij', mean, gains.observed)
+        mean = self._xp.einsum('ak,akin->ain', weights, gains.smoothed)
+        mean += self._xp.einsum('akij,akjn->ain', weights[..., None, None] * carried, gains.pulled)
+        own = self._tables.phi - self._xp.einsum('ain,anj->aij', mean, gains.observed)
         noise = self._noise[:, slots[:, None], slots]
-        both = self._by.einsum('pin,pnm->pim', mean[_FIRST], noise)
-        self._shared = self._by.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])
-        self._shared += self._by.einsum('pim,pjm->pij', both, mean[_SECOND])
+        both = self._xp.einsum('pin,pnm->pim', mean[_FIRST], noise)
+        self._shared = self._xp.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])
+        self._shared += self._xp.einsum('pim,pjm->pij', both, mean[_SECOND])
         self._weights = weights
         self.coasted = 0.0
         self._taken = None
@@ -339,17 +339,17 @@ class ModalFilter:
             if pushed is not None:
                 # What a known load did was foreseen.
                 self._begin_unseen()
-            self._swung = self._by.einsum('aij,aj->ai', self._tables.phi, self._swung)
+            self._swung = self._xp.einsum('aij,aj->ai', self._tables.phi, self._swung)
             if forced is not None:
                 self._swung = self._swung + forced.at[:, -1]
             self._unseen.add(self._x - self._swung, self._p, self._rate())
-        taken = self._by.einsum('ak,ak->a', weights, squares).tolist()
+        taken = self._xp.einsum('ak,ak->a', weights, squares).tolist()
         so_far = zip(self.innovations.squares, taken, strict=True)
         self.innovations = Innovations(tuple(a + b for a, b in so_far), self.innovations.samples + len(slots))
 
     def _rate(self) -> FloatArray:
         """Process noise (A, 2) by what was seen last."""
-        return self._by.einsum('ak,akc->ac', self._weights, self._rates)
+        return self._xp.einsum('ak,akc->ac', self._weights, self._rates)
 
     def _unforeseen(self, seconds: float) -> FloatArray:
         """What a load that nobody sees adds to the covariance (A, 4, 4) so long after the last sample."""
@@ -369,13 +369,13 @@ class ModalFilter:
 
     def _moved(self) -> TipState:
         """Of the end of the block, ``filter_ahead`` later."""
-        x = self._by.einsum('aij,aj->ai', self._later, self._x)
+        x = self._xp.einsum('aij,aj->ai', self._later, self._x)
         if self.inertia.known and self._ahead > 0.0:
             x = x + self.inertia.forced(self._end_ns(), np.array([self._ahead])).at[:, 0]
-        p = self._by.einsum('aij,ajl,aml->aim', self._later, self._unsure(), self._later)
-        p += self._by.einsum('ac,acij->aij', self._rate(), self._later_spread)
+        p = self._xp.einsum('aij,ajl,aml->aim', self._later, self._unsure(), self._later)
+        p += self._xp.einsum('ac,acij->aij', self._rate(), self._later_spread)
         p += self._unforeseen(self.coasted + self._ahead)
-        shared = self._by.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
+        shared = self._xp.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
         t_ns = self._t_ns + round(1e9 * (0.5 * (self._size - 1) * self._period + self._ahead))
         pose, velocity = np.diag(p[:, 0, 0]), np.diag(self._w**2 * p[:, 1, 1])
         for k, (a, b) in enumerate(_PAIRS):
@@ -387,11 +387,11 @@ class ModalFilter:
         """The motion so long (n,) after the last block's last sample."""
         steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
         added = np.stack([mode.spreads(seconds) for mode in self._modes])
-        x = self._by.einsum('anij,aj->nai', steps, self._x)
+        x = self._xp.einsum('anij,aj->nai', steps, self._x)
         if self.inertia.known:
             x = x + self.inertia.forced(self._end_ns(), seconds).at.transpose(1, 0, 2)
-        p = self._by.einsum('anij,ajl,anml->naim', steps, self._unsure(), steps)
-        p += self._by.einsum('ac,ancij->naij', self._rate(), added)
+        p = self._xp.einsum('anij,ajl,anml->naim', steps, self._unsure(), steps)
+        p += self._xp.einsum('ac,ancij->naij', self._rate(), added)
         p += np.stack([self._unforeseen(self.coasted + s) for s in seconds.tolist()])
         return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0])
 

@@ -52,8 +52,8 @@ class UnseenLoads:
         self._seconds = seconds
         self._phi = np.stack([[mode.step(n * seconds) for mode in modes] for n in spans])
         self._added = np.stack([mode.spreads(seconds * self._spans).diagonal(0, 2, 3) for mode in modes], axis=1)
-        self._by = modes[0].by
-        self._kept = self._by.exp(-seconds / LATELY)
+        self._xp = modes[0].xp
+        self._kept = self._xp.exp(-seconds / LATELY)
         self.variances = np.zeros((len(modes), len(spans), 4))
         self._x = np.zeros((spans[-1] + 1, len(modes), 4))
         self._p = np.zeros((spans[-1] + 1, len(modes), 4, 4))
@@ -97,10 +97,10 @@ class UnseenLoads:
             count = len(there)
             at = (self._buffered - there) % len(self._x)
             phi = self._phi[:count]
-            miss = np.square(x - self._by.einsum('haij,haj->hai', phi, self._x[at]))
-            carried = self._by.einsum('haij,hajl->hail', phi, self._p[at])
-            expected = self._by.einsum('hail,hail->hai', carried, phi)
-            expected += self._by.einsum('hac,haci->hai', self._rate[at], self._added[:count])
+            miss = np.square(x - self._xp.einsum('haij,haj->hai', phi, self._x[at]))
+            carried = self._xp.einsum('haij,hajl->hail', phi, self._p[at])
+            expected = self._xp.einsum('hail,hail->hai', carried, phi)
+            expected += self._xp.einsum('hac,haci->hai', self._rate[at], self._added[:count])
             unforeseen = LARGER**2 * np.maximum(miss / BOUND**2 - expected, 0.0)
             held = self.variances[:, :count]
             np.maximum(held, unforeseen.transpose(1, 0, 2), out=held)

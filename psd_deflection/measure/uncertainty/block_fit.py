@@ -81,7 +81,7 @@ class Fitted(NamedTuple):
     misfit: bool
 
 
-def basis(size: int, by: Arithmetic = FIXED) -> FloatArray:
+def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
     """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples.
 
     Of 5 to 11 samples it is one for each two: a motion of 14 Hz and 0.3 mm bends them by more than their noise.
@@ -91,12 +91,12 @@ def basis(size: int, by: Arithmetic = FIXED) -> FloatArray:
     columns: list[FloatArray] = []
     column: FloatArray
     for k in range(orders):
-        column = by.power_many(u, k)
+        column = xp.power_many(u, k)
         # Twice: once leaves rounding that shows.
         for _ in range(2):
             for q in columns:
-                column = column - by.sum(q * column, 0) * q
-        columns.append(column / by.root(float(by.sum(column * column, 0))))
+                column = column - xp.sum(q * column, 0) * q
+        columns.append(column / xp.root(float(xp.sum(column * column, 0))))
     return np.stack(columns, axis=1)
 
 
@@ -138,18 +138,18 @@ class _Terms(NamedTuple):
 
 
 def _terms(
-    q: FloatArray, precision: FloatArray, middle: FloatArray, usual_v: FloatArray | None, by: Arithmetic
+    q: FloatArray, precision: FloatArray, middle: FloatArray, usual_v: FloatArray | None, xp: Arithmetic
 ) -> _Terms:
     """``usual_v`` (K, C): ``v`` of a whole block, None for one."""
     samples, orders = q.shape
     reported = min(orders, (samples + 1) // 2)
-    u = by.einsum('ast,tk->ask', precision, q)
-    information = by.einsum('sj,ask->ajk', q, u)
+    u = xp.einsum('ast,tk->ask', precision, q)
+    information = xp.einsum('sj,ask->ajk', q, u)
     inverted = inverse(information[:, :reported, :reported])
     v = np.diagonal(inverted, axis1=1, axis2=2).T.copy()
     # A block with gaps says less the more noise its coefficients have.
     sure = np.ones(v.shape) if usual_v is None else np.minimum(usual_v[:reported] / v, 1.0) ** 2
-    estimate = by.einsum('ask,akj->asj', u[:, :, :reported], inverted)
+    estimate = xp.einsum('ask,akj->asj', u[:, :, :reported], inverted)
     # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
     used = slice(2, reported, 2) if usual_v is None else slice(1, reported)
     own, mixed = information[:, 0, 0], information[:, 0, used].T
@@ -182,17 +182,17 @@ class BlockFit:
         centers: FloatArray,
         beams: FloatArray,
         slopes: FloatArray | None = None,
-        by: Arithmetic = FIXED,
+        xp: Arithmetic = FIXED,
     ) -> None:
         """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P.
 
         ``slopes``: as :func:`combinations_of` takes them.
         """
         self._size = size
-        self._by = by
-        self._q = basis(size, by)
+        self._xp = xp
+        self._q = basis(size, xp)
         self._orders = self._q.shape[1]
-        self._middle = _at_middle(self._q, by)
+        self._middle = _at_middle(self._q, xp)
         self._count = 2 * len(centers)
         self._diagonal = np.arange(self._count)
         nothing = np.zeros((self._orders, self._count))
@@ -202,36 +202,36 @@ class BlockFit:
 
     def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
         """Use these places (P, 2), m, from now on; :meth:`set_noise` must follow."""
-        self._combinations = combinations_of(centers, beams, slopes, by=self._by)
+        self._combinations = combinations_of(centers, beams, slopes, xp=self._xp)
 
     def set_noise(self, gamma: FloatArray, tones: Sequence[Tone] = ()) -> None:
         """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings, and what vibrates."""
-        by, turn = self._by, self._combinations.turn
-        turned = by.einsum('ac,cdl,bd->abl', turn, gamma, turn)
+        xp, turn = self._xp, self._combinations.turn
+        turned = xp.einsum('ac,cdl,bd->abl', turn, gamma, turn)
         # The covariance with an earlier sample is the transposed one with a later.
         both = np.concatenate((turned.transpose(1, 0, 2)[:, :, :0:-1], turned), axis=2)
         self._between = np.lib.stride_tricks.sliding_window_view(both, self._size, axis=2)[:, :, :, ::-1]
         own = turned[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=self._size > LARGEST)
-        self._whole = _terms(self._q, self._precision, self._middle, None, by)
+        self._whole = _terms(self._q, self._precision, self._middle, None, xp)
         u = self._whole.u
-        self._of_whole = by.einsum('ask,absj->kjab', u, by.einsum('abts,btj->absj', self._between, u))
+        self._of_whole = xp.einsum('ask,absj->kjab', u, xp.einsum('abts,btj->absj', self._between, u))
         self._vibrations = [self._vibration(tone) for tone in tones]
 
     def _vibration(self, tone: Tone) -> _Vibration:
-        by, turn = self._by, self._combinations.turn
+        xp, turn = self._xp, self._combinations.turn
         angle = np.asarray(2.0 * pi * tone.frequency * (np.arange(self._size) - 0.5 * (self._size - 1)), np.float64)
-        waves = np.stack((by.cos_many(angle), by.sin_many(angle)))
-        covariance = by.einsum('ac,cd,bd->ab', turn, tone.covariance, turn)
-        return _Vibration(covariance, waves, by.einsum('ask,s->ak', self._whole.u, waves[0]))
+        waves = np.stack((xp.cos_many(angle), xp.sin_many(angle)))
+        covariance = xp.einsum('ac,cd,bd->ab', turn, tone.covariance, turn)
+        return _Vibration(covariance, waves, xp.einsum('ask,s->ak', self._whole.u, waves[0]))
 
     def _left_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
         """Covariance (B, C, C), m^2, of what the answers leave of a tone; ``weights`` (B, C, N) of blocks with gaps."""
-        by = self._by
+        xp = self._xp
         if weights is None:
-            left = 1.0 - by.einsum('kza,ak->za', x, vibration.whole)
+            left = 1.0 - xp.einsum('kza,ak->za', x, vibration.whole)
             return np.asarray(vibration.covariance * (left[:, :, None] * left[:, None, :]))
-        kept = by.einsum('zas,ws->wza', weights, vibration.waves)
+        kept = xp.einsum('zas,ws->wza', weights, vibration.waves)
         left, sine = 1.0 - kept[0], kept[1]
         both = left[:, :, None] * left[:, None, :] + sine[:, :, None] * sine[:, None, :]
         return np.asarray(vibration.covariance * both)
@@ -260,38 +260,38 @@ class BlockFit:
 
     def _together(self, slots: IntArray, dots: FloatArray) -> Iterator[tuple[_Memory, Fitted]]:
         """The memory after each block and its fit, as far as the present noise holds."""
-        by, count = self._by, self._count
+        xp, count = self._xp, self._count
         blocks, samples, _ = dots.shape
         # Samples first, then orders, blocks and combinations: sums are over what is first.
         z = self._combinations.of(dots.swapaxes(0, 1).reshape(-1, count)).T.reshape(samples, blocks, count)
         # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
-        offset = by.sum(z, 0) / samples
+        offset = xp.sum(z, 0) / samples
         z = z - offset
         whole = samples == self._size
         terms = self._whole if whole else self._terms_without(slots)
         orders, reported = self._orders, len(terms.v)
-        observed = by.einsum('sja,sza->jza', terms.all, z)
+        observed = xp.einsum('sja,sza->jza', terms.all, z)
         c = observed[orders : orders + reported]
         memories, motion = self._motion(c, terms)
-        x, missed = _weights(terms, motion, self._middle, by)
-        value = by.sum(x * observed[:orders], 0) + offset
+        x, missed = _weights(terms, motion, self._middle, xp)
+        value = xp.sum(x * observed[:orders], 0) + offset
         weights: FloatArray | None = None
         if whole:
-            covariance = by.einsum('kza,kjab,jzb->zab', x, self._of_whole, x)
+            covariance = xp.einsum('kza,kjab,jzb->zab', x, self._of_whole, x)
         else:
             weights = np.zeros((blocks, count, self._size))
-            weights[:, :, slots] = by.einsum('ask,kza->zas', terms.u, x)
+            weights[:, :, slots] = xp.einsum('ask,kza->zas', terms.u, x)
             covariance = self._spread(weights)
         misfit = [False] * blocks
         if orders > 1:
             left = samples - reported
             # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = by.sum(z * observed[orders + reported :], 0) - by.sum(observed[:reported] * c, 0)
-            over = squares > (left + _MISFIT * by.root(2.0 * left) if left else np.inf)
+            squares = xp.sum(z * observed[orders + reported :], 0) - xp.sum(observed[:reported] * c, 0)
+            over = squares > (left + _MISFIT * xp.root(2.0 * left) if left else np.inf)
             if np.count_nonzero(over):
                 misfit = [any(row) for row in over.tolist()]
-                rest = z - by.einsum('sk,kza->sza', terms.q[:, :reported], c)
-                missed += np.where(over, _WIDEN * _WIDEN * by.sum(rest * rest, 0) / left, 0.0)
+                rest = z - xp.einsum('sk,kza->sza', terms.q[:, :reported], c)
+                missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / left, 0.0)
             covariance[:, self._diagonal, self._diagonal] += missed
         for vibration in self._vibrations:
             covariance += self._left_of(vibration, x, weights)
@@ -317,9 +317,9 @@ class BlockFit:
         p = self._precision
         cross = p[:, slots[:, None], gone]
         inner = inverse(p[:, gone[:, None], gone])
-        by = self._by
-        own = p[:, slots[:, None], slots] - by.einsum('asg,atg->ast', by.einsum('asg,agh->ash', cross, inner), cross)
-        return _terms(self._q[slots], own, self._middle, self._whole.v, by)
+        xp = self._xp
+        own = p[:, slots[:, None], slots] - xp.einsum('asg,atg->ast', xp.einsum('asg,agh->ash', cross, inner), cross)
+        return _terms(self._q[slots], own, self._middle, self._whole.v, xp)
 
     def _motion(self, c: FloatArray, terms: _Terms) -> tuple[Sequence[_Memory], FloatArray]:
         """The memory after each block, and tau^2 (K, B, C) by it; of order 0 nothing is known beforehand.
@@ -361,14 +361,14 @@ class BlockFit:
         inverted = inverse(expected.reshape(-1, reported - 1, reported - 1)).reshape(
             blocks, count, reported - 1, reported - 1
         )
-        squares = self._by.einsum('zja,zajk,zka->za', own, inverted, own)
-        over = squares > reported - 1 + _CONTRADICTED * self._by.root(2.0 * (reported - 1))
+        squares = self._xp.einsum('zja,zajk,zka->za', own, inverted, own)
+        over = squares > reported - 1 + _CONTRADICTED * self._xp.root(2.0 * (reported - 1))
         np.maximum(usual, own * own + terms.v[1:], out=usual, where=over[:, None])
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (B, C, C) of the weighted sums; ``weights`` (B, C, N)."""
-        by = self._by
-        return by.einsum('zas,zabs->zab', weights, by.einsum('abts,zbt->zabs', self._between, weights))
+        xp = self._xp
+        return xp.einsum('zas,zabs->zab', weights, xp.einsum('abts,zbt->zabs', self._between, weights))
 
 
 def _recent_after(recent: FloatArray, excess: FloatArray, sure: FloatArray) -> FloatArray:
@@ -430,7 +430,7 @@ def inverse(matrices: FloatArray) -> FloatArray:
     return out
 
 
-def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmetic) -> tuple[FloatArray, FloatArray]:
+def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, xp: Arithmetic) -> tuple[FloatArray, FloatArray]:
     """Weights (K, B, C) of the sums h in the middle, and the variance (B, C), m^2, of the motion that they leave out.
 
     ``motion``: tau^2 (K, B, C).
@@ -449,8 +449,8 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmet
         x[used] = found
     if reported < len(motion):
         # So few samples cannot tell of these.
-        untold = middle[reported:, None, None] - by.einsum('akj,jza->kza', terms.information[:, reported:], x)
-        missed += by.sum(untold * untold * motion[reported:], 0)
+        untold = middle[reported:, None, None] - xp.einsum('akj,jza->kza', terms.information[:, reported:], x)
+        missed += xp.sum(untold * untold * motion[reported:], 0)
     return x, missed
 
 
@@ -488,10 +488,10 @@ def _precision(gamma: FloatArray, white: bool) -> FloatArray:
     return np.asarray(np.eye(size) / gamma[:, :1, None])
 
 
-def _at_middle(q: FloatArray, by: Arithmetic) -> FloatArray:
+def _at_middle(q: FloatArray, xp: Arithmetic) -> FloatArray:
     """The polynomials' values (K,) in the middle of the block, between two places where N is even."""
     size, orders = q.shape
     u = (np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5)
     # Each is a combination of powers of u; the middle is u = 0, its constant term.
-    powers = np.stack([by.power_many(u, k) for k in range(orders)], axis=1)
-    return np.asarray(by.solve(by.product(powers.T, powers), by.product(powers.T, q))[0])
+    powers = np.stack([xp.power_many(u, k) for k in range(orders)], axis=1)
+    return np.asarray(xp.solve(xp.product(powers.T, powers), xp.product(powers.T, q))[0])

@@ -54,19 +54,19 @@ class _BaseLine(Combinations):
 
     moving = still = 3
 
-    def __init__(self, centers: FloatArray, beams: FloatArray, by: Arithmetic) -> None:
-        self._by = by
-        self.turn = combinations(beams, by)
+    def __init__(self, centers: FloatArray, beams: FloatArray, xp: Arithmetic) -> None:
+        self._xp = xp
+        self.turn = combinations(beams, xp)
         apart = self._apart = centers[0] - centers[1]
-        self._across, self._along = (float(by.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
-        self._beams_apart = float(by.hypot_many(*(beams[0] - beams[1])))
+        self._across, self._along = (float(xp.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
+        self._beams_apart = float(xp.hypot_many(*(beams[0] - beams[1])))
         self._base_line = self._beams_apart * _HALF
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        z = self._by.einsum('ac,sc->as', self.turn, dots)
+        z = self._xp.einsum('ac,sc->as', self.turn, dots)
         # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
-        z[3] = self._by.hypot_many(z[3] + self._along, z[2] + self._across) - self._base_line
+        z[3] = self._xp.hypot_many(z[3] + self._along, z[2] + self._across) - self._base_line
         return np.asarray(z)
 
     def back(self, value: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -83,38 +83,38 @@ class _BaseLine(Combinations):
         back[:] = self.turn
         back[:, 2] -= (across / along) * to_length
         back[:, 3] *= length / along
-        return dots, self._by.einsum('zac,zab,zbd->zcd', back, covariance, back)
+        return dots, self._xp.einsum('zac,zab,zbd->zcd', back, covariance, back)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
         apart = dots[:, :2] - dots[:, 2:] + self._apart
-        return np.asarray((self._by.hypot_many(apart[:, 0], apart[:, 1]) - self._beams_apart) * _HALF)
+        return np.asarray((self._xp.hypot_many(apart[:, 0], apart[:, 1]) - self._beams_apart) * _HALF)
 
 
 class _Several(Combinations):
     """Of more PSDs."""
 
-    def __init__(self, slopes: FloatArray, left: Left | None, by: Arithmetic) -> None:
+    def __init__(self, slopes: FloatArray, left: Left | None, xp: Arithmetic) -> None:
         """``slopes`` (C, unknowns): how each reading goes with each unknown at rest."""
-        self._by = by
+        self._xp = xp
         self._left = left
-        self.turn = _completed(slopes, by)
+        self.turn = _completed(slopes, xp)
         self.moving = slopes.shape[1]
         self.still = len(slopes)
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        return self._by.einsum('ac,sc->as', self.turn, dots)
+        return self._xp.einsum('ac,sc->as', self.turn, dots)
 
     def back(self, value: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See :class:`Combinations`."""
-        dots = self._by.einsum('ac,za->zc', self.turn, value)
-        return dots, self._by.einsum('ac,zab,bd->zcd', self.turn, covariance, self.turn)
+        dots = self._xp.einsum('ac,za->zc', self.turn, value)
+        return dots, self._xp.einsum('ac,zab,bd->zcd', self.turn, covariance, self.turn)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
         left = dots if self._left is None else self._left(dots)
-        return self._by.einsum('c,sc->s', self.turn[self.moving], left)
+        return self._xp.einsum('c,sc->s', self.turn[self.moving], left)
 
 
 def combinations_of(
@@ -122,7 +122,7 @@ def combinations_of(
     beams: FloatArray,
     slopes: FloatArray | None = None,
     left: Left | None = None,
-    by: Arithmetic = FIXED,
+    xp: Arithmetic = FIXED,
 ) -> Combinations:
     """Of the PSDs at ``centers`` (P, 2) m under ``beams`` (P, 2) m.
 
@@ -130,29 +130,29 @@ def combinations_of(
     the motion of a flat plate. ``left``: what the solver's model leaves of the dots; None: to first order.
     """
     if len(centers) == 2:
-        return _BaseLine(centers, beams, by)
-    return _Several(design_matrix(beams) if slopes is None else slopes, left, by)
+        return _BaseLine(centers, beams, xp)
+    return _Several(design_matrix(beams) if slopes is None else slopes, left, xp)
 
 
-def combinations(beams: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
+def combinations(beams: FloatArray, xp: Arithmetic = FIXED) -> FloatArray:
     """Orthogonal (4, 4): x and y of the middle, twist, base line, each of (x1, y1, x2, y2). ``beams`` (2, 2), m."""
-    along = (beams[0] - beams[1]) / by.hypot_many(*(beams[0] - beams[1]))
+    along = (beams[0] - beams[1]) / xp.hypot_many(*(beams[0] - beams[1]))
     x, y = float(along[0]), float(along[1])
     rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [-y, x, y, -x], [x, y, -x, -y]])
     return np.asarray(rows * _HALF)
 
 
-def _completed(slopes: FloatArray, by: Arithmetic) -> FloatArray:
+def _completed(slopes: FloatArray, xp: Arithmetic) -> FloatArray:
     """Orthogonal (C, C) whose first rows span the columns of ``slopes`` (C, k), of full rank."""
     count = len(slopes)
     rows: list[FloatArray] = []
     for candidate in (*slopes.T, *np.eye(count)):
-        row = candidate / np.sqrt(by.sum(candidate * candidate, 0))
+        row = candidate / np.sqrt(xp.sum(candidate * candidate, 0))
         # Twice: once leaves rounding that shows.
         for _ in range(2):
             for before in rows:
-                row = row - by.sum(before * row, 0) * before
-        left = by.root(float(by.sum(row * row, 0)))
+                row = row - xp.sum(before * row, 0) * before
+        left = xp.root(float(xp.sum(row * row, 0)))
         # Of the unit vectors, those that the rows so far span are left out.
         if len(rows) < slopes.shape[1] or left > _SPANNED:
             rows.append(row / left)

@@ -108,11 +108,11 @@ class BaseLineExcess(Unexplained):
     """Excess length r of the base line between two dots; k = 1."""
 
     def __init__(
-        self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, by: Arithmetic = FIXED
+        self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, xp: Arithmetic = FIXED
     ) -> None:
         """``apart``: dot of PSD 1 less that of PSD 2, m, not (0, 0). ``residual`` (4,) m, ``covariance`` (4, 4) m^2."""
         x, y = apart
-        size = by.root(2.0 * (x * x + y * y))
+        size = xp.root(2.0 * (x * x + y * y))
         ax, ay = x / size, y / size
         x1, y1, x2, y2 = residual
         r = ax * (x1 - x2) + ay * (y1 - y2)
@@ -141,27 +141,27 @@ class UnexplainedResidual(Unexplained):
     """Residual of N PSDs; k = 2N."""
 
     def __init__(
-        self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, by: Arithmetic = FIXED
+        self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, xp: Arithmetic = FIXED
     ) -> None:
         """``residual`` (2N,) m, ``slopes`` J (2N, p), ``covariance`` (2N, 2N) m^2."""
-        self._by = by
+        self._xp = xp
         weights = inverse(covariance[None])[0]
         # Each unknown in its own unit, so that the elimination sees numbers of one size.
-        scaled = slopes / np.sqrt(by.sum(slopes * slopes, 0))
-        weighted = by.einsum('ij,jk->ik', weights, scaled)
-        normal = inverse(by.einsum('ji,jk->ik', scaled, weighted)[None])[0]
-        self._q = np.asarray(weights - by.einsum('ia,ab,jb->ij', weighted, normal, weighted))
+        scaled = slopes / np.sqrt(xp.sum(slopes * slopes, 0))
+        weighted = xp.einsum('ij,jk->ik', weights, scaled)
+        normal = inverse(xp.einsum('ji,jk->ik', scaled, weighted)[None])[0]
+        self._q = np.asarray(weights - xp.einsum('ia,ab,jb->ij', weighted, normal, weighted))
         self._freedom = len(residual) - slopes.shape[1]
         self.value = list(residual)
         self.chi_square = max(self.chi_square_of(self.value), 0.0)
         self.information = np.diag(self._q).tolist()
 
     def _pull(self, value: list[float]) -> FloatArray:
-        return self._by.einsum('ij,j->i', self._q, np.array(value))
+        return self._xp.einsum('ij,j->i', self._q, np.array(value))
 
     def chi_square_of(self, value: list[float]) -> float:
         """See :class:`Unexplained`."""
-        return float(self._by.sum(np.array(value) * self._pull(value), 0))
+        return float(self._xp.sum(np.array(value) * self._pull(value), 0))
 
     def errors_of(self, value: list[float]) -> list[float]:
         """See :class:`Unexplained`."""
@@ -189,9 +189,9 @@ class UnexplainedResidual(Unexplained):
 class ConsistencyCheck:
     """Checks block after block; its state is which PSD was excluded lately, and the errors that are held."""
 
-    def __init__(self, psds: int, unknowns: int, size: int, by: Arithmetic = FIXED) -> None:
+    def __init__(self, psds: int, unknowns: int, size: int, xp: Arithmetic = FIXED) -> None:
         """``psds``: N. ``unknowns``: p; with 2N or more nothing is redundant. ``size``: k of what it is given."""
-        self._by = by
+        self._xp = xp
         self._psds = psds
         self.freedom = max(2 * psds - unknowns, 0)
         self.limit, self._doubtful = _limits(self.freedom)
@@ -241,7 +241,7 @@ class ConsistencyCheck:
         # Both readings of a PSD may be wrong together: the sum of two outer products is at least half of theirs.
         together = 2.0 if self.freedom >= 3 else 1.0
         largest = map(max, squares, self._held, self._lasting)
-        return [_WIDEN * self._by.root(together * square) for square in largest]
+        return [_WIDEN * self._xp.root(together * square) for square in largest]
 
     def _exclude(self, contradict: bool, blamed: Collection[int] | None) -> None:
         if blamed is None:
@@ -305,7 +305,7 @@ def survival(chi_square: float, freedom: int) -> float:
     return float(chdtrc(freedom, chi_square)) if freedom else 1.0
 
 
-def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...], by: Arithmetic = FIXED) -> FloatArray:
+def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...], xp: Arithmetic = FIXED) -> FloatArray:
     """Return ``covariance`` (3, 3) + sum_i (K e_i)(K e_i)^T; ``errors`` e (2N,), ``gain`` K (3, 2N)."""
     caused = gain * np.array(errors)
-    return np.asarray(covariance + by.einsum('ik,jk->ij', caused, caused))
+    return np.asarray(covariance + xp.einsum('ik,jk->ij', caused, caused))

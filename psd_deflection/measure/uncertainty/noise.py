@@ -93,13 +93,13 @@ class StreamNoise:
         steps: FloatArray | float,
         slopes: FloatArray | None = None,
         left: Left | None = None,
-        by: Arithmetic = FIXED,
+        xp: Arithmetic = FIXED,
     ) -> None:
         """``size``: N. ``centers``, ``beams`` (P, 2) m. Of each reading (C,), or of all: ``variances`` m^2 of a sample
         by the rig file, ``steps`` m of the converter. ``slopes``, ``left``: as :func:`combinations_of` takes them.
         """
         self._size = size
-        self._by = by
+        self._xp = xp
         count = self._readings = 2 * len(centers)
         self._wanted = 4 + count * count * size
         self._stated = np.broadcast_to(variances, (count,))
@@ -108,7 +108,7 @@ class StreamNoise:
         self._step = float(self._steps.max())
         self.set_geometry(centers, beams, slopes, left)
         self._mean_of = _mean_weights(size)
-        self._q = basis(size, by)
+        self._q = basis(size, xp)
         self._sums: list[FloatArray] = []
         self._signals = 0
         self._search: ToneSearch | None = None
@@ -132,13 +132,13 @@ class StreamNoise:
     def look_for_tones(self, sums: int) -> None:
         """From now on; so many sum signals are told with the readings."""
         self._signals = sums
-        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, self._by)
+        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, self._xp)
 
     def set_geometry(
         self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
     ) -> None:
         """Use these places, m, from now on."""
-        self._combinations = combinations_of(centers, beams, slopes, left, self._by)
+        self._combinations = combinations_of(centers, beams, slopes, left, self._xp)
         self._moving = self._combinations.turn[: self._combinations.moving]
 
     @property
@@ -156,11 +156,11 @@ class StreamNoise:
 
     def _least(self) -> float:
         """Variance, m^2, that a sample has at least."""
-        return self._by.square(self._step) / 12.0 + _LEAST
+        return self._xp.square(self._step) / 12.0 + _LEAST
 
     def mean_sd(self) -> FloatArray:
         """Standard deviation (C,), m, of the mean of a whole block."""
-        return np.asarray(np.sqrt(self._by.einsum('cl,l->c', self._own(self.gamma), self._mean_of)))
+        return np.asarray(np.sqrt(self._xp.einsum('cl,l->c', self._own(self.gamma), self._mean_of)))
 
     def add(self, index: int, slots: IntArray, dots: FloatArray, sums: FloatArray | None = None) -> bool:
         """A block's samples; True where they ended a segment that changed ``gamma``.
@@ -253,17 +253,17 @@ class StreamNoise:
         if self._average is None or not self.measured:
             return self._from_file()
         # Of the average: each segment alone is so uncertain that much would be taken off its colour.
-        return self._with_steps(_covariance(self._average, self._sure, self._by))
+        return self._with_steps(_covariance(self._average, self._sure, self._xp))
 
     def _with_steps(self, gamma: FloatArray) -> FloatArray:
         out = gamma.copy()
         for c, (stated, step) in enumerate(zip(self._stated.tolist(), self._steps.tolist(), strict=True)):
-            rounding = self._by.square(step) / 12.0
+            rounding = self._xp.square(step) / 12.0
             level = max(float(out[c, c, 0]), rounding)
             out[c, c, 0] = level
             # More than the rig file's noise does not dither with certainty: a reading on the edge between
             # two steps varies by half a step with next to no noise.
-            out[c, c] += undithered(min(level, stated) - rounding, step, self._by)
+            out[c, c] += undithered(min(level, stated) - rounding, step, self._xp)
         return out
 
     def _close(self) -> bool:
@@ -277,15 +277,15 @@ class StreamNoise:
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
         dots = np.concatenate([d for _, _, d in blocks])
         series = np.column_stack((dots, self._combinations.fixed(dots)))
-        lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size, self._by)
+        lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size, self._xp)
         self._observed += 1
-        moved = self._by.einsum('sc,ac->sa', dots, self._moving)
-        rough = _roughness(places, np.column_stack((moved, series)), self._q, self._by)
+        moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
+        rough = _roughness(places, np.column_stack((moved, series)), self._q, self._xp)
         count = self._readings
         if self._search is not None:
             still = np.column_stack((series[:, count:], np.concatenate(sums)))
             self.tones = self._search.tones(places, moved, still, self._moving)
-        fixed = _covariance(lags[count:, count:], sure, self._by)[0, 0]
+        fixed = _covariance(lags[count:, count:], sure, self._xp)[0, 0]
         self._judge(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()
         return True
@@ -295,10 +295,10 @@ class StreamNoise:
 
         ``rough``: of the combinations that move, the readings and the combination that does not, m^2.
         """
-        moving, by, least = self._moving, self._by, self._least()
-        turned = by.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure, by), moving)
-        means = by.product(turned, self._mean_of) + least / self._size
-        fixed_mean = float(by.product(fixed, self._mean_of)) + least / self._size
+        moving, xp, least = self._moving, self._xp, self._least()
+        turned = xp.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure, xp), moving)
+        means = xp.product(turned, self._mean_of) + least / self._size
+        fixed_mean = float(xp.product(fixed, self._mean_of)) + least / self._size
         fixed_rough = float(rough[-1])
         still = bool((means * fixed_rough <= _MOTION * rough[: len(moving)] * fixed_mean).all())
         if not self.at_rest:
@@ -309,7 +309,7 @@ class StreamNoise:
                 self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough), np.ones(self._size))
             return
         before = self._average if self._average is not None else gamma
-        known = by.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
+        known = xp.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
         ratio = means / known
         if (ratio > _RISEN).any():
             self._louder = self._louder + 1 if still else 0
@@ -345,7 +345,7 @@ def _mean_weights(size: int) -> FloatArray:
     return np.asarray(np.where(lags > 0, 2.0, 1.0) * (size - lags) / size**2)
 
 
-def _roughness(places: IntArray, series: FloatArray, q: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
+def _roughness(places: IntArray, series: FloatArray, q: FloatArray, xp: Arithmetic = FIXED) -> FloatArray:
     """Variance (c,) of ``series`` (n, c) about a polynomial in each block: the median over the blocks of a segment."""
     size, orders = q.shape
     blocks, slots = np.divmod(places, size)
@@ -353,14 +353,14 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray, by: Arithmet
     here = np.zeros((SEGMENT_BLOCKS, size))
     whole[blocks, slots] = series
     here[blocks, slots] = 1.0
-    count = by.sum(here, 1)
+    count = xp.sum(here, 1)
     enough = count >= orders + 2
     whole, here, count = whole[enough], here[enough], count[enough]
-    whole = (whole - by.sum(whole, 1)[:, None] / count[:, None, None]) * here[:, :, None]
-    gram = by.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
-    h = by.einsum('bsc,sk->bkc', whole, q)
-    left = by.einsum('bsc,bsc->bc', whole, whole) - by.einsum(
-        'bkc,bkc->bc', h, by.einsum('bkj,bjc->bkc', inverse(gram), h)
+    whole = (whole - xp.sum(whole, 1)[:, None] / count[:, None, None]) * here[:, :, None]
+    gram = xp.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
+    h = xp.einsum('bsc,sk->bkc', whole, q)
+    left = xp.einsum('bsc,bsc->bc', whole, whole) - xp.einsum(
+        'bkc,bkc->bc', h, xp.einsum('bkj,bjc->bkc', inverse(gram), h)
     )
     if not len(left):
         return np.zeros(series.shape[1])
@@ -368,15 +368,15 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray, by: Arithmet
 
 
 def _autocovariance(
-    places: IntArray, series: FloatArray, length: int, lags: int, by: Arithmetic = FIXED
+    places: IntArray, series: FloatArray, length: int, lags: int, xp: Arithmetic = FIXED
 ) -> tuple[FloatArray, FloatArray]:
     """(c, c, lags) of ``series`` (n, c) at ``places`` (n,) below ``length``, less mean and slope; gaps are left out.
 
     It need not be a covariance. The second is for :func:`_covariance`.
     """
     at = places - places.sum() / len(places)
-    centred = series - by.sum(series, 0) / len(series)
-    centred -= at[:, None] * (by.einsum('t,tc->c', at, centred) / float(by.sum(at * at, 0)))
+    centred = series - xp.sum(series, 0) / len(series)
+    centred -= at[:, None] * (xp.einsum('t,tc->c', at, centred) / float(xp.sum(at * at, 0)))
     count = series.shape[1]
     far = _FAR * lags
     padded = np.zeros((length, count + 1))
@@ -387,7 +387,7 @@ def _autocovariance(
     # Where two samples are never that far apart, nothing is known: taken as independent.
     each = np.where(present > 0.5, products[:count, :count] / np.maximum(present, 1.0), 0.0)
     # Mean and slope were taken off: 2 of length / far degrees of freedom of what is slower than that.
-    slow = by.einsum('cdl,l->cd', each, _mean_weights(far))
+    slow = xp.einsum('cdl,l->cd', each, _mean_weights(far))
     taken = (slow + slow.T)[:, :, None] / (length / far - 2)
     # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
     # divisor: that of the lag at which gaps cost most, so that none is too small.
@@ -396,7 +396,7 @@ def _autocovariance(
     return each[:, :, :lags] + taken, present / max(float(whole.min()), _PAIRS * float(whole[0]))
 
 
-def _covariance(each: FloatArray, sure: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
+def _covariance(each: FloatArray, sure: FloatArray, xp: Arithmetic = FIXED) -> FloatArray:
     """The autocovariance (c, c, N) ``each`` as the covariance of N samples.
 
     ``sure`` (N,): times it, it is one. As little of that is taken as makes it one.
@@ -406,29 +406,29 @@ def _covariance(each: FloatArray, sure: FloatArray, by: Arithmetic = FIXED) -> F
     for share in _SHARES if size <= LARGEST else (1.0,):
         mixed = each * (1.0 + share * (sure - 1.0))
         mixed[range(count), range(count), 0] += own
-        if share == 1.0 or _positive(mixed, by):
+        if share == 1.0 or _positive(mixed, xp):
             break
     return mixed
 
 
-def _positive(gamma: FloatArray, by: Arithmetic) -> bool:
+def _positive(gamma: FloatArray, xp: Arithmetic) -> bool:
     """Whether no weighted sum of N samples of each reading has a variance of 0 or below."""
     count, _, size = gamma.shape
     both = np.concatenate((gamma.transpose(1, 0, 2)[:, :, :0:-1], gamma), axis=2)
     lags = np.arange(size) - np.arange(size)[:, None] + size - 1
     whole = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
-    return bool(np.isfinite(whole).all()) and by.is_positive(whole)
+    return bool(np.isfinite(whole).all()) and xp.is_positive(whole)
 
 
-def undithered(variance: float, step: float, by: Arithmetic = FIXED) -> float:
+def undithered(variance: float, step: float, xp: Arithmetic = FIXED) -> float:
     """Variance of the error that rounding to ``step`` leaves in the mean of many readings of that noise."""
     if step <= 0.0:
         return 0.0
-    decay = 4.0 * pi * pi * max(variance, 0.0) / by.square(step)
+    decay = 4.0 * pi * pi * max(variance, 0.0) / xp.square(step)
     total = 0.0
     for k in range(1, 200):
-        term = by.exp(-min(decay * k * k, 700.0)) / (k * k)
+        term = xp.exp(-min(decay * k * k, 700.0)) / (k * k)
         total += term
         if term < 1e-9:
             break
-    return by.square(step) / (2.0 * pi * pi) * total
+    return xp.square(step) / (2.0 * pi * pi) * total

@@ -62,12 +62,12 @@ class Tone(NamedTuple):
 class ToneSearch:
     """Looks for tones in segments of ``blocks`` blocks of ``size`` samples."""
 
-    def __init__(self, size: int, blocks: int, by: Arithmetic = FIXED) -> None:
-        self._by = by
+    def __init__(self, size: int, blocks: int, xp: Arithmetic = FIXED) -> None:
+        self._xp = xp
         self._length = size * blocks
         angle = np.asarray(2.0 * pi / self._length * np.arange(self._length), np.float64)
-        self._window = 0.5 - 0.5 * by.cos_many(angle)
-        self._scale = 2.0 / (self._length * float(by.sum(self._window * self._window, 0)))
+        self._window = 0.5 - 0.5 * xp.cos_many(angle)
+        self._scale = 2.0 / (self._length * float(xp.sum(self._window * self._window, 0)))
         self._first = int(_LOWEST * blocks)
         # At half the sample rate a tone's other half folds onto it.
         self._last = self._length // 2 - 2
@@ -91,12 +91,12 @@ class ToneSearch:
         count = moving.shape[1]
         series = _filled(places, np.column_stack((moving, still)), self._length)
         spectrum = transform(series * self._window[:, None])
-        power = self._by.power_spectrum(spectrum)
+        power = self._xp.power_spectrum(spectrum)
         above = power / self._floor(power)
         free = np.zeros(len(power), dtype=bool)
         free[self._first : self._last + 1] = True
         peaks = above[:, :count].max(axis=1)
-        scale = self._scale * self._by.square(self._length / len(places))
+        scale = self._scale * self._xp.square(self._length / len(places))
         out: list[Tone] = []
         for _ in range(_MOST):
             peak = int(np.argmax(np.where(free, peaks, 0.0)))
@@ -105,18 +105,18 @@ class ToneSearch:
             wide = max(_NARROW, int(_BROAD * peak))
             band = slice(max(peak - wide, self._first), min(peak + wide, self._last) + 1)
             free[band] = False
-            strength = self._by.sum(power[band], 0)
+            strength = self._xp.sum(power[band], 0)
             observed = above[band].max(axis=0) > _OBSERVED
             moved = strength[:count] * observed[:count]
             if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
                 continue
             own = spectrum[band, :count] * observed[:count]
-            cross = self._by.times_conjugate(own[:, :, None], own[:, None, :]).real
-            covariance = scale * self._by.sum(np.ascontiguousarray(cross), 0)
-            weight = self._by.sum(power[band, :count] * observed[:count], 1)
-            at = self._by.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
-            frequency = float(at) / float(self._by.sum(weight, 0)) / self._length
-            out.append(Tone(frequency, self._by.einsum('ac,ab,bd->cd', turn, covariance, turn)))
+            cross = self._xp.times_conjugate(own[:, :, None], own[:, None, :]).real
+            covariance = scale * self._xp.sum(np.ascontiguousarray(cross), 0)
+            weight = self._xp.sum(power[band, :count] * observed[:count], 1)
+            at = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
+            frequency = float(at) / float(self._xp.sum(weight, 0)) / self._length
+            out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
         return tuple(out)
 
     def _floor(self, power: FloatArray) -> FloatArray:

@@ -54,12 +54,12 @@ def grown(x: FloatArray, y: FloatArray, k: Size) -> Pair:
     return x * by_distance, y * by_distance
 
 
-def shrunk(x: FloatArray, y: FloatArray, k: float, by: Arithmetic = LIBRARY) -> Pair:
+def shrunk(x: FloatArray, y: FloatArray, k: float, xp: Arithmetic = LIBRARY) -> Pair:
     """The inverse of :func:`grown`.
 
     With k < 0 the reading falls again farther out: no dot is sought where its slope is below a tenth.
     """
-    read = by.hypot_many(x, y)
+    read = xp.hypot_many(x, y)
     farthest = math.sqrt(0.3 / -k) if k < 0.0 else math.inf
     true = np.minimum(read, farthest)
     for _ in range(_NEWTON):
@@ -99,27 +99,27 @@ class DetectorResponse(NamedTuple):
     crosstalk_yx: float
     nonlinearity: float
 
-    def reading(self, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY) -> Pair:
+    def reading(self, x: FloatArray, y: FloatArray, xp: Arithmetic = LIBRARY) -> Pair:
         """What the detector reads of a dot at (x, y), m."""
         angle = np.asarray(self.rotation)
-        x, y = turned(x, y, by.cos_many(angle), by.sin_many(angle))
+        x, y = turned(x, y, xp.cos_many(angle), xp.sin_many(angle))
         x, y = grown(x, y, self.nonlinearity)
         x, y = crossed(x, y, self.crosstalk_xy, self.crosstalk_yx)
         return scaled(x, y, self.gain_x, self.gain_y)
 
-    def place(self, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY) -> Pair:
+    def place(self, x: FloatArray, y: FloatArray, xp: Arithmetic = LIBRARY) -> Pair:
         """The inverse of :meth:`reading`."""
         x, y = unscaled(x, y, self.gain_x, self.gain_y)
         x, y = uncrossed(x, y, self.crosstalk_xy, self.crosstalk_yx)
-        x, y = shrunk(x, y, self.nonlinearity, by)
+        x, y = shrunk(x, y, self.nonlinearity, xp)
         angle = np.asarray(self.rotation)
-        return turned(x, y, by.cos_many(angle), -by.sin_many(angle))
+        return turned(x, y, xp.cos_many(angle), -xp.sin_many(angle))
 
-    def slopes(self, x: FloatArray, y: FloatArray, by: Arithmetic = LIBRARY) -> FloatArray:
+    def slopes(self, x: FloatArray, y: FloatArray, xp: Arithmetic = LIBRARY) -> FloatArray:
         """Derivatives (2, 2, ...) of :meth:`reading` by x and y, by central differences."""
         step = 1e-6
         columns = [
-            np.subtract(self.reading(x + a, y + b, by), self.reading(x - a, y - b, by)) / (2.0 * step)
+            np.subtract(self.reading(x + a, y + b, xp), self.reading(x - a, y - b, xp)) / (2.0 * step)
             for a, b in ((step, 0.0), (0.0, step))
         ]
         return np.stack(columns, axis=1)

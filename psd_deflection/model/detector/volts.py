@@ -114,6 +114,6 @@ def dot_noise_variances(rig: Rig) -> FloatArray:
     """
     step = rig.converter.volts_per_count
     channels = zip(rig.sensitivities.ravel().tolist(), rig.noises[:, :2].ravel().tolist(), strict=True)
-    by = FIXED
-    rounding = by.square(step) / 12.0
-    return np.array([by.square(sensitivity) * (by.square(noise) + rounding) for sensitivity, noise in channels])
+    xp = FIXED
+    rounding = xp.square(step) / 12.0
+    return np.array([xp.square(sensitivity) * (xp.square(noise) + rounding) for sensitivity, noise in channels])

@@ -27,7 +27,7 @@ class LinkStatics:
     """Tip compliance of one link.
 
     ``length`` L, m; ``bending_stiffness`` EI, N m^2; ``torsional_stiffness`` GJ, N m^2; all > 0.
-    ``clamp_bending`` and ``clamp_torsion``: turn of the clamp per moment at the root, rad/(N m). ``by``: what computes.
+    ``clamp_bending`` and ``clamp_torsion``: turn of the clamp per moment at the root, rad/(N m). ``xp``: what computes.
     """
 
     length: float
@@ -35,14 +35,14 @@ class LinkStatics:
     torsional_stiffness: float
     clamp_bending: float = 0.0
     clamp_torsion: float = 0.0
-    by: Arithmetic = LIBRARY
+    xp: Arithmetic = LIBRARY
     _force: float = field(init=False)
     _twist: float = field(init=False)
 
     def __post_init__(self) -> None:
         # A force F turns the clamp by its moment F L, which moves the tip by L times that.
-        by, length = self.by, self.length
-        bending = by.power(length, 3) / (3.0 * self.bending_stiffness) + self.clamp_bending * by.square(length)
+        xp, length = self.xp, self.length
+        bending = xp.power(length, 3) / (3.0 * self.bending_stiffness) + self.clamp_bending * xp.square(length)
         object.__setattr__(self, '_force', bending)
         object.__setattr__(self, '_twist', self.length / self.torsional_stiffness + self.clamp_torsion)
 
@@ -62,8 +62,8 @@ class LinkStatics:
 
     def sag(self, weight_per_length: float) -> float:
         """How far (m) the tip sinks under the link's own weight, N/m, which turns the clamp by its moment w L^2/2."""
-        bent = weight_per_length * self.by.power(self.length, 4) / (8.0 * self.bending_stiffness)
-        return bent + self.clamp_bending * weight_per_length * self.by.power(self.length, 3) / 2.0
+        bent = weight_per_length * self.xp.power(self.length, 4) / (8.0 * self.bending_stiffness)
+        return bent + self.clamp_bending * weight_per_length * self.xp.power(self.length, 3) / 2.0
 
     def tip_load(self, dx: float, dy: float, theta: float) -> tuple[float, float, float]:
         """(fx N, fy N, tz N m) at the tip centroid that give this deflection without tip moments."""

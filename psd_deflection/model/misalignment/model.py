@@ -83,40 +83,40 @@ def response_of(p: FloatArray, psd: int) -> DetectorResponse:
     return DetectorResponse(rotation, gain_x, gain_y, xy, yx, p[first + _CUBIC])
 
 
-def readings(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY) -> FloatArray:
+def readings(p: FloatArray, pose: FloatArray, length: float, xp: Arithmetic = LIBRARY) -> FloatArray:
     """x1 y1 x2 y2, m, (4, n). ``p`` (COUNT,); ``pose`` (3, n): dX m, dY m, theta rad; ``length`` L, m."""
     out = np.empty((4, pose.shape[1]))
     for psd in range(2):
         center = p[_PER_PSD * psd + _CENTER : _PER_PSD * psd + _CENTER + 2]
         response = response_of(p, psd)
-        m0 = response.place(p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1], by)
-        place = _points(p, psd, center + m0, pose, length, by) - center[:, None]
-        out[2 * psd : 2 * psd + 2] = response.reading(place[0], place[1], by)
+        m0 = response.place(p[ZERO + 2 * psd], p[ZERO + 2 * psd + 1], xp)
+        place = _points(p, psd, center + m0, pose, length, xp) - center[:, None]
+        out[2 * psd : 2 * psd + 2] = response.reading(place[0], place[1], xp)
     return out
 
 
 def _points(
-    p: FloatArray, psd: int, beam: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY
+    p: FloatArray, psd: int, beam: FloatArray, pose: FloatArray, length: float, xp: Arithmetic = LIBRARY
 ) -> FloatArray:
     """Plate points (2, n) under the beam that is at ``beam`` (2,) on the plate at rest."""
     dx, dy, theta = pose
     k = p[SLOPE] / length
-    slopes = by.tan_many(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
+    slopes = xp.tan_many(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
     height = p[_PER_PSD * psd + _HEIGHT]
     place = beam[0], beam[1], height
-    return np.stack(points_under_leaning(place, (slopes[0], slopes[1]), (dx, dy, theta, -k * dy, k * dx), by))
+    return np.stack(points_under_leaning(place, (slopes[0], slopes[1]), (dx, dy, theta, -k * dy, k * dx), xp))
 
 
-def by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY) -> FloatArray:
+def by_parameters(p: FloatArray, pose: FloatArray, length: float, xp: Arithmetic = LIBRARY) -> FloatArray:
     """Derivatives of the readings (4, COUNT, n) at ``p`` (COUNT,) and ``pose`` (3, n), by central differences."""
     out = np.zeros((4, COUNT, pose.shape[1]))
     for psd in range(2):
-        _psd_by_parameters(out[2 * psd : 2 * psd + 2], p, psd, pose, length, by)
+        _psd_by_parameters(out[2 * psd : 2 * psd + 2], p, psd, pose, length, xp)
     return out
 
 
 def _psd_by_parameters(
-    out: FloatArray, p: FloatArray, psd: int, pose: FloatArray, length: float, by: Arithmetic
+    out: FloatArray, p: FloatArray, psd: int, pose: FloatArray, length: float, xp: Arithmetic
 ) -> None:
     """The rows ``out`` (2, COUNT, n) of one PSD.
 
@@ -125,33 +125,33 @@ def _psd_by_parameters(
     first = _PER_PSD * psd
     at, zero = slice(first + _CENTER, first + _CENTER + 2), slice(ZERO + 2 * psd, ZERO + 2 * psd + 2)
     response = response_of(p, psd)
-    m0 = np.array(response.place(p[zero][0], p[zero][1], by))
+    m0 = np.array(response.place(p[zero][0], p[zero][1], xp))
     beam = p[at] + m0
-    place = _points(p, psd, beam, pose, length, by) - p[at, None]
-    turned = response.slopes(place[0], place[1], by)
+    place = _points(p, psd, beam, pose, length, xp) - p[at, None]
+    turned = response.slopes(place[0], place[1], xp)
 
     def moved_beam(d: FloatArray) -> FloatArray:
-        return _points(p, psd, beam + d, pose, length, by)
+        return _points(p, psd, beam + d, pose, length, xp)
 
     def read_there(d: FloatArray) -> FloatArray:
-        return np.stack(response_of(p + d, psd).reading(place[0], place[1], by))
+        return np.stack(response_of(p + d, psd).reading(place[0], place[1], xp))
 
     def rest_place(d: FloatArray) -> FloatArray:
-        return np.array(response_of(p + d, psd).place(p[zero][0], p[zero][1], by))
+        return np.array(response_of(p + d, psd).place(p[zero][0], p[zero][1], xp))
 
     def point(d: FloatArray) -> FloatArray:
-        return _points(p + d, psd, beam, pose, length, by)
+        return _points(p + d, psd, beam, pose, length, xp)
 
     # How the dot goes with the beam, and its reading with the beam.
     under = np.stack([_difference(moved_beam, 1e-6 * unit) for unit in np.eye(2)], axis=1)
-    read = by.einsum('ijn,jkn->ikn', turned, under)
+    read = xp.einsum('ijn,jkn->ikn', turned, under)
     out[:, at] = read - turned
-    out[:, zero] = by.einsum('ijn,jk->ikn', read, by.inverse_of(response.slopes(m0[0], m0[1], by)))
+    out[:, zero] = xp.einsum('ijn,jk->ikn', read, xp.inverse_of(response.slopes(m0[0], m0[1], xp)))
     for i in (*range(first, first + _CENTER), first + _CUBIC):
-        away = by.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
+        away = xp.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
         out[:, i] = _difference(read_there, _step(i)) + away
     for i in (first + _HEIGHT, _BEAMS + 2 * psd, _BEAMS + 2 * psd + 1, SLOPE):
-        out[:, i] = by.einsum('ijn,jn->in', turned, _difference(point, _step(i)))
+        out[:, i] = xp.einsum('ijn,jn->in', turned, _difference(point, _step(i)))
 
 
 def _step(index: int) -> FloatArray:

@@ -99,8 +99,8 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         center = v[INDEX[f'psd_{i + 1}.center_x']], v[INDEX[f'psd_{i + 1}.center_y']]
         # A laser that was not aimed at the true centre stands where the rig file has it.
         x, y = (z - (1.0 - aimed[i]) * (c - f) for z, c, f in zip(psd.zero, center, psd.center, strict=True))
-        by = FIXED
-        v[ZERO + 2 * i : ZERO + 2 * i + 2] = response_of(v, i).reading(np.array(x), np.array(y), by)
+        xp = FIXED
+        v[ZERO + 2 * i : ZERO + 2 * i + 2] = response_of(v, i).reading(np.array(x), np.array(y), xp)
     return RigVector(v, clamp, others, frozenset(listed), tilts)
 
 
@@ -162,12 +162,12 @@ def known_of_rig(rig: Rig) -> Known:
         below = np.tril_indices(n, -1)
         correlation[below] = given
         correlation.T[below] = given
-        by = FIXED
-        values, vectors = by.eigen(correlation)
+        xp = FIXED
+        values, vectors = xp.eigen(correlation)
         if values[0] < -1e-6 * n:
             raise ConfigError('calibration.correlations: contradict each other; take them from a calibration unchanged')
         # Rounding in the file leaves values a little below zero.
-        correlation = by.product(vectors * np.maximum(values, 0.0), vectors.T)
+        correlation = xp.product(vectors * np.maximum(values, 0.0), vectors.T)
     own = [i for i, name in enumerate(names) if name in INDEX]
     at = np.array([INDEX[names[i]] for i in own], dtype=np.intp)
     joint = correlation * np.outer(sds, sds)

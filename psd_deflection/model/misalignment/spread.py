@@ -33,20 +33,20 @@ LEVELS = 5
 class ParameterSpread:
     """The spread of the dots that the calibration of one rig file leaves. Make it with :meth:`from_rig`."""
 
-    def __init__(self, values: FloatArray, covariance: FloatArray, length: float, by: Arithmetic = FIXED) -> None:
+    def __init__(self, values: FloatArray, covariance: FloatArray, length: float, xp: Arithmetic = FIXED) -> None:
         """``values`` (COUNT,), ``covariance`` (COUNT, COUNT): as the readings' model has them; ``length``: L, m."""
-        self._by = by
+        self._xp = xp
         scale = _scale(covariance)
-        size, vectors = by.eigen(covariance / np.outer(scale, scale))
+        size, vectors = xp.eigen(covariance / np.outer(scale, scale))
         kept = size > 1e-14
         root = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
         levels = np.linspace(-1.0, 1.0, LEVELS)
         points = np.stack(np.meshgrid(levels, levels, levels), axis=0).reshape(3, -1)
-        slopes = by.product(dots_by_parameters(values, points * RANGE[:, None], length, by), root)
+        slopes = xp.product(dots_by_parameters(values, points * RANGE[:, None], length, xp), root)
         basis = np.stack([_terms(*point) for point in points.T.tolist()])
         self._shape = (4, root.shape[1])
         # Smooth as they are, a quartic gives them to 1e-4; a block has no time for differences.
-        self._quartic = by.least_squares(basis, slopes.reshape(len(basis), -1))
+        self._quartic = xp.least_squares(basis, slopes.reshape(len(basis), -1))
 
     @classmethod
     def from_rig(
@@ -64,14 +64,14 @@ class ParameterSpread:
         if zero_variances:
             covariance[ZERO:] = covariance[:, ZERO:] = 0.0
             covariance[ZERO:, ZERO:] = np.diag(zero_variances)
-        by = FIXED
-        return cls(vector_of_rig(rig, effects).as_used, covariance, rig.link.length, by)
+        xp = FIXED
+        return cls(vector_of_rig(rig, effects).as_used, covariance, rig.link.length, xp)
 
     def factor(self, dx: float, dy: float, theta: float) -> FloatArray:
         """B (4, k), m, at a pose (m, m, rad): the corrected dots spread by B B^T."""
         across, twist = float(RANGE[0]), float(RANGE[2])
         terms = np.array(_terms(dx / across, dy / across, theta / twist))
-        return self._by.einsum('t,ti->i', terms, self._quartic).reshape(self._shape)
+        return self._xp.einsum('t,ti->i', terms, self._quartic).reshape(self._shape)
 
 
 def _pairs() -> list[tuple[int, int]]:
@@ -94,16 +94,16 @@ def _terms(x: float, y: float, t: float) -> list[float]:
     return [second[a] * second[b] for a, b in _PAIRS]
 
 
-def dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = FIXED) -> FloatArray:
+def dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, xp: Arithmetic = FIXED) -> FloatArray:
     """S^-1 (df/dp), (n, 4, COUNT), at poses (3, n)."""
-    slopes = by_parameters(p, pose, length, by).transpose(2, 0, 1).copy()
-    read = readings(p, pose, length, by)
+    slopes = by_parameters(p, pose, length, xp).transpose(2, 0, 1).copy()
+    read = readings(p, pose, length, xp)
     for psd in range(2):
         own = slice(2 * psd, 2 * psd + 2)
         response = response_of(p, psd)
-        x, y = response.place(read[2 * psd], read[2 * psd + 1], by)
-        turned = response.slopes(x, y, by).transpose(2, 0, 1)
-        slopes[:, own] = by.solve(turned, slopes[:, own])
+        x, y = response.place(read[2 * psd], read[2 * psd + 1], xp)
+        turned = response.slopes(x, y, xp).transpose(2, 0, 1)
+        slopes[:, own] = xp.solve(turned, slopes[:, own])
     return slopes
 
 

@@ -147,14 +147,14 @@ MOVES_FREQUENCY = EffectParameter(
 @dataclass(slots=True, eq=False)
 class Reading:
     """n readings during the correction: ``dots`` (2P, n) m, ``sums`` (P, n) V, ``warmer`` (n,) K,
-    ``t`` (n,) s. Changed in place. ``by``: what computes.
+    ``t`` (n,) s. Changed in place. ``xp``: what computes.
     """
 
     dots: FloatArray
     sums: FloatArray
     warmer: FloatArray
     t: FloatArray
-    by: Arithmetic = LIBRARY
+    xp: Arithmetic = LIBRARY
 
 
 @dataclass(slots=True, eq=False)

@@ -23,10 +23,10 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     moved = pose[0], pose[1], pose[2], phi, omega
     if physics.slopes.any() and not physics.psds_at_base:
         slopes = physics.slopes[:, :1], physics.slopes[:, 1:]
-        qx, qy = points_under_leaning(places, slopes, moved, physics.by)
+        qx, qy = points_under_leaning(places, slopes, moved, physics.xp)
     else:
         fall = landings if physics.psds_at_base else points_under
-        qx, qy = fall(places, moved, physics.by)
+        qx, qy = fall(places, moved, physics.xp)
     dots = np.empty_like(beams)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])

@@ -25,7 +25,7 @@ class Physics:
     ``beams``: l_i, on the plate if ``psds_at_base``; ``slopes``: how much each goes sideways along Z.
     ``half_area``: half width and height of the active areas. ``noise`` (3P,), V rms of each channel.
     ``dark`` (P, 3): x, y and sum of each PSD with its laser off, V.
-    ``by``: what computes; the simulator's is the libraries'.
+    ``xp``: what computes; the simulator's is the libraries'.
     ``phase``: how long after each sample the quantities are taken, below ``period``, s.
     """
 
@@ -56,7 +56,7 @@ class Physics:
     psds_at_base: bool = False
     weight_per_length: float = 0.0
     constant_force: FloatArray = field(default_factory=lambda: np.zeros(2))
-    by: Arithmetic = LIBRARY
+    xp: Arithmetic = LIBRARY
 
     @classmethod
     def of(cls, rig: Rig) -> Physics:
@@ -104,7 +104,7 @@ class Physics:
             self.torsional_stiffness,
             self.clamp_bending,
             self.clamp_torsion,
-            self.by,
+            self.xp,
         )
 
     @property

@@ -36,7 +36,7 @@ class TipLoads:
         self.zeroed = False
         self._seconds = rig.estimator.block_size / rig.converter.sample_rate_hz
         self._physics = Physics.of(rig)
-        self._physics.by = FIXED
+        self._physics.xp = FIXED
         for active in effects:
             if active.effect.configure is not None:
                 active.effect.configure(self._physics, active.values)

@@ -56,7 +56,7 @@ class BasePairSolver(Solver):
         Raises ConfigError for another assumption, SolverError with the reason if an unknown cannot be seen.
         """
         self._count = check_twist(geometry)
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         heights = np.asarray(geometry.heights, dtype=np.float64)
         for i, height in enumerate(heights.tolist()):
             if height >= 0.0:
@@ -121,18 +121,18 @@ class BasePairSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
-        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances, self._arithmetic)
-        by, spread = self._arithmetic, np.array(found.covariance)
-        covariance = by.product(by.product(self._matrix[:3], spread), self._matrix[:3].T).tolist()
-        return answer(found, by.product(self._matrix, np.array(found.parameters)).tolist(), covariance)
+        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances, self._xp)
+        xp, spread = self._xp, np.array(found.covariance)
+        covariance = xp.product(xp.product(self._matrix[:3], spread), self._matrix[:3].T).tolist()
+        return answer(found, xp.product(self._matrix, np.array(found.parameters)).tolist(), covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
-        total = self._arithmetic.total
+        total = self._xp.total
         dx, dy, theta, phi, omega = [total([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for place in self._rows:
-            px, py, jx, jy = landing(place, (dx, dy, theta, phi, omega), self._arithmetic)
+            px, py, jx, jy = landing(place, (dx, dy, theta, phi, omega), self._xp)
             predicted.append(px)
             predicted.append(py)
             for j in (jx, jy):

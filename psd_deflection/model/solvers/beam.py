@@ -44,7 +44,7 @@ class BeamSolver(Solver):
         """
         check_twist(geometry)
         self._slope = slope_per_metre(geometry)
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         self._tie = self._slope if tilt_in_dots else 0.0
         for i, height in enumerate(np.asarray(geometry.heights).tolist()):
             if abs(1.0 + self._tie * height) < 1e-3:
@@ -66,8 +66,8 @@ class BeamSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         q = [c + m for c, m in zip(self._centers, dots, strict=True)]
-        start = flat_pose(q, self._beams, self._arithmetic)
-        found = fit(self._model, start, q, variances, self._arithmetic)
+        start = flat_pose(q, self._beams, self._xp)
+        found = fit(self._model, start, q, variances, self._xp)
         dx, dy, theta = found.parameters
         return answer(found, (dx, dy, theta, -self._slope * dy, self._slope * dx), found.covariance)
 
@@ -78,7 +78,7 @@ class BeamSolver(Solver):
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for (lx, ly), height in zip(self._beams, self._heights, strict=True):
-            qx, qy, jx, jy = crossing((lx, ly, height), pose, self._arithmetic)
+            qx, qy, jx, jy = crossing((lx, ly, height), pose, self._xp)
             predicted.append(qx)
             predicted.append(qy)
             rows.append((jx[0] + tie * jx[4], jx[1] - tie * jx[3], jx[2]))
@@ -87,7 +87,7 @@ class BeamSolver(Solver):
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """As of a flat plate: the tilts change it by their own size, some thousandths. See :class:`Solver`."""
-        return flat_gain(self._centers, dots, variances, solution, self._arithmetic)
+        return flat_gain(self._centers, dots, variances, solution, self._xp)
 
 
 def slope_per_metre(geometry: Geometry) -> float:

@@ -54,7 +54,7 @@ class ExactSolver(Solver):
     def __init__(self, geometry: Geometry) -> None:
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
         self._places = tuple(self._centers.ravel().tolist())
@@ -65,7 +65,7 @@ class ExactSolver(Solver):
         """One block; pure floats for two PSDs. See :class:`Solver`."""
         if self._count != 2:
             return self._solve_any(dots, variances)
-        by = self._arithmetic
+        xp = self._xp
         x1, y1, x2, y2 = dots
         vx1, vy1, vx2, vy2 = variances
         try:
@@ -82,8 +82,8 @@ class ExactSolver(Solver):
         qy = q1y - self._c2y - y2
         lx = l1x - self._l2x
         ly = l1y - self._l2y
-        theta = by.atan2(qx * ly - qy * lx, qx * lx + qy * ly)
-        c, s = by.cos_sin(theta)
+        theta = xp.atan2(qx * ly - qy * lx, qx * lx + qy * ly)
+        c, s = xp.cos_sin(theta)
         steps = 0
         status = SolverStatus.OK
         if mx != my:
@@ -93,7 +93,7 @@ class ExactSolver(Solver):
                 (mx - my) * lx * ly,
                 mx * qx * lx + my * qy * ly,
                 mx * qx * ly - my * qy * lx,
-                by,
+                xp,
             )
         if theta != theta or steps == _MAX_STEPS:
             status = SolverStatus.NOT_CONVERGED
@@ -144,20 +144,20 @@ class ExactSolver(Solver):
         """Any number of PSDs."""
         (qx, qy), (lx, ly) = (self._centers + np.reshape(dots, (-1, 2))).T, self._beams.T
         wx, wy = 1.0 / checked_variances(np.array(variances)).reshape(-1, 2).T
-        by = self._arithmetic
+        xp = self._xp
 
         def dot(a: FloatArray, b: FloatArray) -> float:
-            return float(by.product(a, b))
+            return float(xp.product(a, b))
 
-        sum_x, sum_y = float(by.sum(wx, 0)), float(by.sum(wy, 0))
+        sum_x, sum_y = float(xp.sum(wx, 0)), float(xp.sum(wy, 0))
         # Each axis is centred with its own weights.
-        xx, xy, xq = (a - by.product(wx, a) / sum_x for a in (lx, ly, qx))
-        yx, yy, yq = (a - by.product(wy, a) / sum_y for a in (lx, ly, qy))
+        xx, xy, xq = (a - xp.product(wx, a) / sum_x for a in (lx, ly, qx))
+        yx, yy, yq = (a - xp.product(wy, a) / sum_y for a in (lx, ly, qy))
         along = dot(wx, xq * xx) + dot(wy, yq * yy)
         across = dot(wx, xq * xy) - dot(wy, yq * yx)
         difference = dot(wx, xy * xy - xx * xx) + dot(wy, yx * yx - yy * yy)
         mixed = dot(wx, xx * xy) - dot(wy, yx * yy)
-        theta, c, s, steps = _newton(by.atan2(across, along), difference, mixed, along, across, by)
+        theta, c, s, steps = _newton(xp.atan2(across, along), difference, mixed, along, across, xp)
         rx = xq - c * xx - s * xy
         ry = yq - c * yy + s * yx
         px, py = qx - rx, qy - ry
@@ -174,7 +174,7 @@ class ExactSolver(Solver):
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """In closed form. See :class:`Solver`."""
-        return flat_gain(self._places, dots, variances, solution, self._arithmetic)
+        return flat_gain(self._places, dots, variances, solution, self._xp)
 
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks; vectorised for two PSDs. See :class:`Solver`."""
@@ -191,7 +191,7 @@ class ExactSolver(Solver):
 
     def _chunk(self, m: FloatArray, v: FloatArray, out: Solutions, part: slice) -> None:
         """The lines of :meth:`solve`, for arrays."""
-        by = self._arithmetic
+        xp = self._xp
         x1, y1, x2, y2 = m.T
         vx1, vy1, vx2, vy2 = v.T
         mx = 1.0 / (vx1 + vx2)
@@ -204,11 +204,11 @@ class ExactSolver(Solver):
         ly = self._l1y - self._l2y
         across = qx * ly - qy * lx
         along = qx * lx + qy * ly
-        theta = by.atan2_many(across, along)
+        theta = xp.atan2_many(across, along)
         if (mx == my).all():
             converged = np.isfinite(theta)
             # cos and sin of the arctangent with one square root.
-            size = by.hypot_many(along, across)
+            size = xp.hypot_many(along, across)
             with np.errstate(invalid='ignore'):
                 c = np.where(size != 0.0, along / size, 1.0)
                 s = np.where(size != 0.0, across / size, 0.0)
@@ -219,10 +219,10 @@ class ExactSolver(Solver):
                 (mx - my) * lx * ly,
                 mx * qx * lx + my * qy * ly,
                 mx * qx * ly - my * qy * lx,
-                by,
+                xp,
             )
-            c = by.cos_many(theta)
-            s = by.sin_many(theta)
+            c = xp.cos_many(theta)
+            s = xp.sin_many(theta)
         dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), tuple(v.T))
         for where, values in (
             (out.pose, (dx, dy, theta)),
@@ -235,10 +235,10 @@ class ExactSolver(Solver):
 
 
 def _newton(
-    theta: float, difference: float, mixed: float, along: float, across: float, by: Arithmetic
+    theta: float, difference: float, mixed: float, along: float, across: float, xp: Arithmetic
 ) -> tuple[float, float, float, int]:
     """Minimise F from ``theta``: difference R - P, mixed Q, along A, across B of the module's text."""
-    c, s = by.cos_sin(theta)
+    c, s = xp.cos_sin(theta)
     steps = 0
     while steps < _MAX_STEPS:
         steps += 1
@@ -248,7 +248,7 @@ def _newton(
         # The magnitude of the curvature makes every step go downhill.
         step = slope / abs(curvature)
         theta -= step
-        c, s = by.cos_sin(theta)
+        c, s = xp.cos_sin(theta)
         if abs(step) < _LAST_STEP:
             break
     return theta, c, s, steps
@@ -260,13 +260,13 @@ def _newton_many(
     mixed: FloatArray,
     along: FloatArray,
     across: FloatArray,
-    by: Arithmetic,
+    xp: Arithmetic,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """:func:`_newton` for n blocks, until the slowest ends; also returns which converged."""
     converged = np.zeros(theta.shape, dtype=bool)
     for _ in range(_MAX_STEPS):
-        c = by.cos_many(theta)
-        s = by.sin_many(theta)
+        c = xp.cos_many(theta)
+        s = xp.sin_many(theta)
         turned = c * c - s * s
         slope = difference * s * c + mixed * turned + along * s - across * c
         curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s

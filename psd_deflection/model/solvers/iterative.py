@@ -47,16 +47,16 @@ class IterativeSolver(Solver):
         """Bind to ``geometry``. Raises SolverError if the beams coincide."""
         self._count = check_twist(geometry)
         beams = np.asarray(geometry.beams)
-        by = self._arithmetic = geometry.arithmetic
-        middle = by.sum(beams, axis=0) / len(beams)
+        xp = self._xp = geometry.arithmetic
+        middle = xp.sum(beams, axis=0) / len(beams)
         self._lx, self._ly = middle.tolist()
-        self._spread = float(by.sum(((beams - middle) ** 2).ravel(), axis=0))
+        self._spread = float(xp.sum(((beams - middle) ** 2).ravel(), axis=0))
         self._rows = tuple(map(tuple, np.hstack((geometry.centers, beams - middle)).tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         count = self._count
-        cos_sin = self._arithmetic.cos_sin
+        cos_sin = self._xp.cos_sin
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
         mx = my = 0.0
         for qx, qy, _, _ in plate:
@@ -95,13 +95,13 @@ class IterativeSolver(Solver):
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """In closed form: the disagreement stays 0 if a dot moves. See :class:`Solver`."""
         count = self._count
-        by = self._arithmetic
-        c, s = by.cos_sin(solution.theta)
+        xp = self._xp
+        c, s = xp.cos_sin(solution.theta)
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
-        mx = by.total([p[0] for p in plate]) / count
-        my = by.total([p[1] for p in plate]) / count
+        mx = xp.total([p[0] for p in plate]) / count
+        my = xp.total([p[1] for p in plate]) / count
         # The beams are about their mean, so the dots' mean counts for nothing.
-        agreement = by.total([c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate])
+        agreement = xp.total([c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate])
         gx, gy = s * mx + c * my, s * my - c * mx
         rows: tuple[list[float], list[float], list[float]] = ([], [], [])
         for _, _, lx, ly in plate:

@@ -61,7 +61,7 @@ class MinimumTiltSolver(Solver):
         if angles not in ('rotation', 'azimuth'):
             raise ConfigError(f'minimum_tilt.angles = {angles!r}: must be one of rotation, azimuth')
         self._rotation = angles == 'rotation'
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         if check_twist(geometry) != 2:
             raise SolverError('minimum_tilt takes two PSDs; with three at different heights use pose')
         if np.any(geometry.heights):
@@ -74,7 +74,7 @@ class MinimumTiltSolver(Solver):
         lx = self._l1x - self._l2x
         ly = self._l1y - self._l2y
         self._flat = ExactSolver(geometry)
-        self._length = self._arithmetic.hypot(lx, ly)
+        self._length = self._xp.hypot(lx, ly)
         self._ex = lx / self._length
         self._ey = ly / self._length
 
@@ -85,7 +85,7 @@ class MinimumTiltSolver(Solver):
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
-        by = self._arithmetic
+        xp = self._xp
         x1, y1, x2, y2 = dots
         q1x = self._c1x + x1
         q1y = self._c1y + y1
@@ -93,14 +93,14 @@ class MinimumTiltSolver(Solver):
         qy = q1y - self._c2y - y2
         ex = self._ex
         ey = self._ey
-        long = by.hypot(qx, qy)
+        long = xp.hypot(qx, qy)
         if not long > self._length:
             flat = self._flat.solve(dots, variances)
             if flat.status is SolverStatus.OK and self._too_short(long, flat.theta, variances):
                 return flat._replace(status=SolverStatus.INADMISSIBLE)
             return flat
-        theta = by.atan2(qx * ey - qy * ex, qx * ex + qy * ey)
-        c, s = by.cos_sin(theta)
+        theta = xp.atan2(qx * ey - qy * ex, qx * ex + qy * ey)
+        c, s = xp.cos_sin(theta)
         cos_beta = self._length / long
         sin_beta = sqrt((1.0 - cos_beta) * (1.0 + cos_beta))
         # Plate point 1 in the base's axes, along and across the base line.
@@ -111,13 +111,13 @@ class MinimumTiltSolver(Solver):
         back_e = self._l1x * ex + self._l1y * ey - cos_beta * reach
         back_n = self._l1y * ex - self._l1x * ey - off
         covariance = self._covariance(c * ex + s * ey, c * ey - s * ex, reach, off, cos_beta, long, variances)
-        psi = by.atan2((cos_beta - 1.0) * ex * ey, ex * ex + cos_beta * ey * ey) if self._rotation else 0.0
+        psi = xp.atan2((cos_beta - 1.0) * ex * ey, ex * ex + cos_beta * ey * ey) if self._rotation else 0.0
         return Solution(
             back_e * ex - back_n * ey,
             back_e * ey + back_n * ex,
             theta + psi,
-            -by.asin(sin_beta * ey),
-            by.atan2(sin_beta * ex, cos_beta),
+            -xp.asin(sin_beta * ey),
+            xp.atan2(sin_beta * ex, cos_beta),
             covariance,
             (0.0, 0.0, 0.0, 0.0),
             SolverStatus.OK,
@@ -126,7 +126,7 @@ class MinimumTiltSolver(Solver):
 
     def _too_short(self, long: float, theta: float, variances: tuple[float, ...]) -> bool:
         """Whether noise along the base line cannot explain that it is too short for any tilt."""
-        c, s = self._arithmetic.cos_sin(theta)
+        c, s = self._xp.cos_sin(theta)
         ax = c * self._ex + s * self._ey
         ay = c * self._ey - s * self._ex
         vx1, vy1, vx2, vy2 = variances

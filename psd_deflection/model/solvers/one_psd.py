@@ -21,7 +21,7 @@ class OnePsd:
     """Bound to ``geometry``; see the module's text."""
 
     def __init__(self, geometry: Geometry) -> None:
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         self._centers = [(float(x), float(y)) for x, y in np.asarray(geometry.centers)]
         self._beams = [(float(x), float(y)) for x, y in np.asarray(geometry.beams)]
 
@@ -36,7 +36,7 @@ class OnePsd:
         qx = self._centers[psd][0] + dot[0]
         qy = self._centers[psd][1] + dot[1]
         lx, ly = self._beams[psd]
-        c, s = self._arithmetic.cos_sin(theta)
+        c, s = self._xp.cos_sin(theta)
         vx, vy = variances
         # d(d)/d(theta) = -R'(theta) q
         gx = s * qx + c * qy

@@ -58,29 +58,29 @@ class PoseSolver(Solver):
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)
         self._heights = heights
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         self._rows = tuple(map(tuple, places.tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block. See :class:`Solver`."""
         points = np.asarray(dots).reshape(-1, 2) + self._centers
-        start = flat_poses(points, self._beams, self._arithmetic).tolist()
-        found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances, self._arithmetic)
+        start = flat_poses(points, self._beams, self._xp).tolist()
+        found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances, self._xp)
         return answer(found, found.parameters, found.covariance)
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """(J^T W J)^-1 J^T W at the answer. See :class:`Solver`."""
-        by = self._arithmetic
-        slopes = crossings(np.array(solution[:5]), self._beams, self._heights, by)[1].reshape(-1, 5)
+        xp = self._xp
+        slopes = crossings(np.array(solution[:5]), self._beams, self._heights, xp)[1].reshape(-1, 5)
         weighted = slopes.T / np.array(variances)
-        return by.solve(by.product(weighted, slopes), weighted)[:3]
+        return xp.solve(xp.product(weighted, slopes), weighted)[:3]
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta, phi, omega = x
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for place in self._rows:
-            qx, qy, jx, jy = crossing(place, (dx, dy, theta, phi, omega), self._arithmetic)
+            qx, qy, jx, jy = crossing(place, (dx, dy, theta, phi, omega), self._xp)
             predicted.append(qx)
             predicted.append(qy)
             rows.append(jx)

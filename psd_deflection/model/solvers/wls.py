@@ -61,7 +61,7 @@ class WlsSolver(Solver):
         check_twist(geometry)
         beams, zeros = np.asarray(geometry.beams).tolist(), np.asarray(geometry.zeros).tolist()
         self._rows = tuple((lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(beams, zeros, strict=True))
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         self._known: _Weighted | None = None
         self._fixed = fixed_weights(geometry, weights, row_scaling)
 
@@ -124,7 +124,7 @@ class WlsSolver(Solver):
         known = self._known
         # In a run all blocks without a finding have the same variances.
         if known is None or known.variances != variances:
-            known = self._known = _Weighted(self._rows, variances, self._arithmetic)
+            known = self._known = _Weighted(self._rows, variances, self._xp)
         return known
 
 
@@ -136,9 +136,9 @@ class _Weighted:
     :class:`Solution`; ``variance`` rad^2: of the twist.
     """
 
-    def __init__(self, rows: _Rows, variances: tuple[float, ...], by: Arithmetic) -> None:
+    def __init__(self, rows: _Rows, variances: tuple[float, ...], xp: Arithmetic) -> None:
         """``rows``: lx, ly, x0, y0 of each PSD, m. Raises SolverError if a variance is 0."""
-        self._rows, self.variances, self._by = rows, variances, by
+        self._rows, self.variances, self._xp = rows, variances, xp
         try:
             self.weights = [(1.0 / variances[2 * i], 1.0 / variances[2 * i + 1]) for i in range(len(rows))]
         except ZeroDivisionError:
@@ -170,7 +170,7 @@ class _Weighted:
     def gain(self) -> FloatArray:
         """See :class:`Solver`."""
         places = tuple([place for lx, ly, _, _ in self._rows for place in (lx, ly)])
-        out = weighted_gain(places, 0.0, self.variances, self.covariance, self._by)
+        out = weighted_gain(places, 0.0, self.variances, self.covariance, self._xp)
         # Every block gets this one.
         out.setflags(write=False)
         return out

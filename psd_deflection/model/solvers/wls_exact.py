@@ -44,7 +44,7 @@ class WlsExactSolver(Solver):
         row_scaling: tuple[float, ...] = THESIS_ROW_SCALING,
     ) -> None:
         """Bind to ``geometry``; same options and errors as :class:`WlsSolver`."""
-        self._arithmetic = geometry.arithmetic
+        self._xp = geometry.arithmetic
         self._wls = WlsSolver(geometry, weights, row_scaling)
         self._rows = tuple((lx, ly) for lx, ly in np.asarray(geometry.beams).tolist())
         self._fixed = tuple([s * s for s in row_scaling]) if weights == 'thesis' else None
@@ -72,22 +72,22 @@ class WlsExactSolver(Solver):
         xy /= sum_x
         yx /= sum_y
         yy /= sum_y
-        by = self._arithmetic
+        xp = self._xp
         spread = mixed = 0.0
         for i, (lx, ly) in enumerate(self._rows):
             wx = w[2 * i]
             wy = w[2 * i + 1]
-            spread += wx * by.square(ly - xy) + wy * by.square(lx - yx)
+            spread += wx * xp.square(ly - xy) + wy * xp.square(lx - yx)
             mixed += wx * (ly - xy) * lx - wy * (lx - yx) * ly
         kappa = mixed / spread
-        sine = (linear.theta + kappa) / by.hypot(1.0, kappa)
+        sine = (linear.theta + kappa) / xp.hypot(1.0, kappa)
         if not -1.0 <= sine <= 1.0:
             status = SolverStatus.INADMISSIBLE if sine == sine else SolverStatus.NOT_CONVERGED
             return linear._replace(status=status)
-        theta = by.asin(sine) - by.atan(kappa)
-        c, s = by.cos_sin(theta)
+        theta = xp.asin(sine) - xp.atan(kappa)
+        c, s = xp.cos_sin(theta)
         # (1 - cos) by the half angle: no digits are lost at small angles.
-        versine = 2.0 * by.square(by.sin(0.5 * theta))
+        versine = 2.0 * xp.square(xp.sin(0.5 * theta))
         fx = linear.dx + xy * (s - linear.theta) - xx * versine
         fy = linear.dy - yx * (s - linear.theta) - yy * versine
         # Derivative of this answer by the linear answer, in plate axes.

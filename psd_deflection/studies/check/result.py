@@ -171,18 +171,18 @@ class Checkup(StudyResult):
                 {
                     'loads': list(p.loads),
                     'observed': p.observed,
-                    'channels': _by(DOTS, p.channels.tolist()),
-                    'sd': _by(DOTS, p.sd.tolist()),
+                    'channels': _by_name(DOTS, p.channels.tolist()),
+                    'sd': _by_name(DOTS, p.sd.tolist()),
                     'size': size if p.sized else None,
                 }
                 for p, size in zip(self.pushes, self.sizes, strict=True)
             ],
-            'noise': {**_by(CHANNELS, measured.noise.tolist()), 'rig_file': measured.stated},
-            'hum': {'hz': measured.hum_hz, **_by(CHANNELS, measured.hum.tolist())},
+            'noise': {**_by_name(CHANNELS, measured.noise.tolist()), 'rig_file': measured.stated},
+            'hum': {'hz': measured.hum_hz, **_by_name(CHANNELS, measured.hum.tolist())},
             'sums': measured.sums.tolist(),
             'light': dict(self.light),
-            'drift': _by(DOTS, self.drift.tolist()),
-            'drift_sd': _by(DOTS, self.drift_sd.tolist()),
+            'drift': _by_name(DOTS, self.drift.tolist()),
+            'drift_sd': _by_name(DOTS, self.drift_sd.tolist()),
             'notes': list(self.notes),
         }
 
@@ -295,5 +295,5 @@ def _wiring_json(wiring: Wiring) -> dict[str, object]:
     return {'psds_exchanged': wiring.exchanged, **axes}
 
 
-def _by(names: Sequence[str], values: Sequence[float]) -> dict[str, float]:
+def _by_name(names: Sequence[str], values: Sequence[float]) -> dict[str, float]:
     return dict(zip(names, values, strict=True))

@@ -22,7 +22,7 @@ def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
     if not remembered:
         # Unloaded until now.
         remembered += [0.0, 0.0, 0.0]
-    amplitude, kept = values['amplitude'], block.physics.by.exp(-block.seconds / values['time_constant'])
+    amplitude, kept = values['amplitude'], block.physics.xp.exp(-block.seconds / values['time_constant'])
     for row in range(3):
         grown = block.pose[row] - amplitude * kept * remembered[row]
         block.pose[row] = grown / (1.0 + amplitude * (1.0 - kept))

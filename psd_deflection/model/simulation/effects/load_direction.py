@@ -18,8 +18,8 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 
 
 def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
-    by = block.physics.by
-    c, s = by.cos(values['angle']), by.sin(values['angle'])
+    xp = block.physics.xp
+    c, s = xp.cos(values['angle']), xp.sin(values['angle'])
     fx, fy, _ = block.loads
     block.loads[:2] = c * fx + s * fy, c * fy - s * fx
 

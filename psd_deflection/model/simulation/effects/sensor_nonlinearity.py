@@ -18,7 +18,7 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 def _correct(reading: Reading, values: Values) -> None:
     i = 2 * (int(values['psd']) - 1)
     dots = reading.dots
-    dots[i], dots[i + 1] = shrunk(dots[i], dots[i + 1], values['k'], reading.by)
+    dots[i], dots[i + 1] = shrunk(dots[i], dots[i + 1], values['k'], reading.xp)
 
 
 EFFECT = Effect(
