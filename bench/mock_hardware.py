@@ -131,11 +131,11 @@ def shaped(arm: Arm, programs: list[Program]) -> None:
         arm.given.publish(move(chance))
         arm.spin(float(chance.uniform(0.1, 0.4)))
     arm.spin(1.0)
-    judged(arm, since, 'shaper')
+    evaluated(arm, since, 'shaper')
     since = len(arm.positions)
     followed(arm, chance)
     arm.spin(1.0)
-    judged(arm, since, 'action of the shaper')
+    evaluated(arm, since, 'action of the shaper')
 
 
 def move(chance: np.random.Generator) -> JointTrajectory:
@@ -177,7 +177,7 @@ def followed(arm: Arm, chance: np.random.Generator) -> None:
         raise SystemExit(f'action: a goal of too few joints: {bad}')
 
 
-def judged(arm: Arm, since: int, what: str) -> None:
+def evaluated(arm: Arm, since: int, what: str) -> None:
     """SystemExit if the joints made a step since then, or did not move."""
     moved, step = float(np.ptp(arm.positions[since:], axis=0).max()), arm.step(since)
     print(f'{what}: the joints moved {moved:.3f} rad, the largest step is {step:.5f} rad')

@@ -154,7 +154,7 @@ def recorded(turn: float, seed: int, folder: Path) -> tuple[Path, list[tuple[flo
     return found, annotated
 
 
-def judged(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]:
+def evaluated(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]:
     """What is wrong with the answer in ``out``; nothing if it is right."""
     message = json.loads((out / 'result.json').read_text())
     wrong = []
@@ -181,7 +181,7 @@ def main() -> int:
         recording, late = recorded(args.turn, args.seed, Path(folder) / 'recordings')
         out = args.out or Path(folder) / 'found'
         print(command('discover', str(recording), '--out', str(out), '--quiet'))
-        wrong = judged(out, args.turn, late)
+        wrong = evaluated(out, args.turn, late)
     print('\n'.join(wrong) or 'named, with its size')
     return int(bool(wrong))
 

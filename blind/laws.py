@@ -99,7 +99,7 @@ def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Disco
     return found.tree(), found
 
 
-def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
+def evaluated(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
     """How the answer compares with the truth."""
     message = next((u['law'] for u in got['unknown'] if u['law']), None)
     row: dict[str, Any] = {'verdict': got['verdict'], 'law': None if message is None else message['expression']}
@@ -159,7 +159,7 @@ def _answer_to_law(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
     law, seed = job
     start = time.perf_counter()
     got, _ = answer(None if law is None else sized(law), seed)
-    row = judged(law if law is None else sized(law), got)
+    row = evaluated(law if law is None else sized(law), got)
     return {**row, 'number': seed, 'seconds': time.perf_counter() - start}
 
 

@@ -279,7 +279,7 @@ def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def judge(run: Run, rig: Rig, late: int = 0) -> Result:
+def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
     """Return the run through the pipeline, against the truth.
 
     What is told of the base comes ``late`` samples after its stamp.
@@ -418,20 +418,20 @@ def main() -> None:
     parser.add_argument('--bias', type=float, default=0.0, help='share by which what is told of the base is too large')
     parser.add_argument('--late', type=int, default=0, help='it comes so many samples after its stamp')
     args = parser.parse_args()
-    judged: dict[str, list[Result]] = {}
+    evaluated: dict[str, list[Result]] = {}
     for kind in args.kinds:
         seeds = range(args.seed, args.seed + args.runs)
-        judged[kind] = [
-            judge(biased(make(kind, args.seconds, seed), args.bias), rig_of(), args.late)
+        evaluated[kind] = [
+            evaluate(biased(make(kind, args.seconds, seed), args.bias), rig_of(), args.late)
             for seed in watched(seeds, kind)
         ]
-    print(table({kind: figures(results) for kind, results in judged.items()}))
-    if 'chirp' in judged:
+    print(table({kind: figures(results) for kind, results in evaluated.items()}))
+    if 'chirp' in evaluated:
         print(
             'predicted / held at its worst up to the mode: '
-            + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, by_frequency(judged['chirp']), strict=True))
+            + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, by_frequency(evaluated['chirp']), strict=True))
         )
-    for kind, results in judged.items():
+    for kind, results in evaluated.items():
         unseen = np.concatenate([r.unseen for r in results])
         inside = np.mean(np.abs(unseen[np.isfinite(unseen[:, 0])]) < 3.0, axis=0)
         shares = ', '.join(f'{a} {share:.1%}' for a, share in zip(AXES, inside, strict=True))

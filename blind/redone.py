@@ -249,7 +249,7 @@ def curves(made: Bench, load_case: HeldLoad, stem: str) -> Curves:
     return Curves(t, found)
 
 
-def judged(made: Bench, load_case: HeldLoad, stem: str, by: str) -> Any:
+def evaluated(made: Bench, load_case: HeldLoad, stem: str, by: str) -> Any:
     """Return the answer of ``validate``: by the camera, its clock put right, or by the truth."""
     reference = f'{load_case.name}_{by}.csv'
     align = ['--align', '--exposure', str(made.plan.exposure)] if by == 'camera' else []
@@ -304,8 +304,8 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
         if load_case.side >= 0:
             drawn[load_case.name] = {stem: curves(made, load_case, stem) for stem in STEMS}
         if load_case.side == 0:
-            answers[load_case.name] = {f'{stem} truth': judged(made, load_case, stem, 'truth') for stem in RIGS}
-            answers[load_case.name] |= {f'{stem} camera': judged(made, load_case, stem, 'camera') for stem in STEMS}
+            answers[load_case.name] = {f'{stem} truth': evaluated(made, load_case, stem, 'truth') for stem in RIGS}
+            answers[load_case.name] |= {f'{stem} camera': evaluated(made, load_case, stem, 'camera') for stem in STEMS}
         bar.update()
     bar.close()
     summary = _summary(made, link, answers)

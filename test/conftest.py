@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import Phase, settings
 
-from test.judges import Golden, RayPlane
+from test.oracles import Golden, RayPlane
 from test.shaken import Shaker, shake
 from tools.tiers import ROOMS, TIERS, holds, paths_of
 

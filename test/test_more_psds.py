@@ -36,7 +36,7 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run.session_texts import zero_text
-from test.judges import RayPlane
+from test.oracles import RayPlane
 
 Counts = npt.NDArray[np.int32]
 Spoil = Callable[[Counts], None]

@@ -166,8 +166,8 @@ def test_a_check_of_a_wheel_without_the_page_fails(tmp_path: Path, capsys: pytes
     (made / 'dist').mkdir()
     (made / 'dist/x.tar.gz').touch()
     (made / 'build/release/bin').mkdir(parents=True)
-    for judge in ('twine', 'check-wheel-contents', 'zizmor', 'hadolint', 'python', 'pip-audit'):
-        (made / 'build/release/bin' / judge).symlink_to('/bin/true')
+    for tool in ('twine', 'check-wheel-contents', 'zizmor', 'hadolint', 'python', 'pip-audit'):
+        (made / 'build/release/bin' / tool).symlink_to('/bin/true')
     bom = made / 'build/release/bin/cyclonedx-py'
     bom.write_text('#!/bin/sh\nfor last; do :; done; echo \'{"components": [1]}\' >"$last"\n')
     bom.chmod(0o755)

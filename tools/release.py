@@ -281,7 +281,7 @@ def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[l
     if len(wheels) != 1 or len(sdists) != 1:
         return [f'{dist}: {len(wheels)} wheels and {len(sdists)} sdists, one of each is due'], left
     problems += check_wheel(root, wheels[0])
-    judges: tuple[tuple[str, list[str | Path]], ...] = (
+    checks: tuple[tuple[str, list[str | Path]], ...] = (
         ('twine', ['check', '--strict', wheels[0], sdists[0]]),
         # W009: two packages at the top, on purpose.
         ('check-wheel-contents', ['--ignore', 'W009', wheels[0]]),
@@ -289,10 +289,10 @@ def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[l
         ('hadolint', ['packaging/Dockerfile']),
         ('python', ['-c', RENDER]),
     )
-    for judge, words in judges:
-        status, message = _tool([tools / 'bin' / judge, *words], root)
+    for name, words in checks:
+        status, message = _tool([tools / 'bin' / name, *words], root)
         if status:
-            problems.append(f'{judge}: {message}')
+            problems.append(f'{name}: {message}')
     python = installed / 'bin/python'
     found, silent = check_licences_of(python)
     problems += found

@@ -344,8 +344,8 @@ class Reader:
     def _to_the_end(self, line: str, verdict: str = '') -> None:
         program = self._start(line)
         status = program.wait()
-        judged = verdict != '' and re.search(verdict, program.text) and 'Traceback' not in program.text
-        if status != 0 and not judged:
+        holds = verdict != '' and re.search(verdict, program.text) and 'Traceback' not in program.text
+        if status != 0 and not holds:
             raise RuntimeError(f'exit status {status}\n{program.text[-2000:]}')
 
     def _live(self, line: str) -> None:

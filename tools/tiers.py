@@ -265,7 +265,7 @@ ROOMS: Mapping[str, Room] = {
     ),
     'history': Room(
         (
-            'psd_deflection/run/last_step.py',
+            'psd_deflection/run/last_load_change.py',
             'psd_deflection/run/monitor/history.py',
             'psd_deflection/run/monitor/kept_history.py',
         ),

@@ -62,7 +62,7 @@ def left_by_a_kill(rig: Rig, bags: Path, after_s: float) -> tuple[Path, int]:
     return folder, killed_ns
 
 
-def judge(folder: Path, killed_ns: int) -> float:
+def evaluate(folder: Path, killed_ns: int) -> float:
     """Seconds between the last sample that is left and the kill; AssertionError if a reader disagrees."""
     before = [int(b.t_ns[-1]) for b in open_recording(folder).blocks()]
     recover(folder)
@@ -93,7 +93,7 @@ def main() -> int:
                 more = rotating if number % 4 == 3 else {}
                 rig = load_rig(None, {'port': port, 'record': True, 'bag_dir': str(bags), 'keep_zero': False, **more})
                 folder, killed_ns = left_by_a_kill(rig, bags, chance.uniform(0.0, 1.5))
-                lost.append(judge(folder, killed_ns))
+                lost.append(evaluate(folder, killed_ns))
                 shutil.rmtree(bags)
         finally:
             rig_process.end()

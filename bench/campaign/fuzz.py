@@ -52,7 +52,7 @@ def timed() -> Iterator[None]:
         raise AssertionError(f'{took:.1f} s for one input')
 
 
-def judged(target: Target, content: bytes) -> list[str]:
+def evaluated(target: Target, content: bytes) -> list[str]:
     """``target(content)``. AssertionError if a rejection is not one line."""
     rejected = target(content)
     for text in rejected:
@@ -475,7 +475,7 @@ def main() -> int:
     found.mkdir(parents=True, exist_ok=True)
 
     def one_input(content: bytes) -> None:
-        judged(target, content)
+        evaluated(target, content)
 
     atheris.Setup([sys.argv[0], str(corpus), *LIMITS, f'-artifact_prefix={found}/{name}_', *sys.argv[2:]], one_input)
     atheris.Fuzz()

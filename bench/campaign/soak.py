@@ -149,7 +149,7 @@ class Spread:
         return math.sqrt(spread) / self.count if self.count else math.nan
 
 
-def judged(name: str, lost: int, growth: int, errors: Spread) -> bool:
+def evaluated(name: str, lost: int, growth: int, errors: Spread) -> bool:
     """Print the verdict of one part."""
     good = lost == 0 and growth < ALLOWED_GROWTH and (not errors.count or errors.std <= ALLOWED_STD_NS)
     print(
@@ -241,7 +241,7 @@ def real_time(minutes: float) -> bool:
         errors = Spread()
         for error in (stamps - truth)[settled].tolist():
             errors.add(error)
-        return judged('real time', lost, growth, errors)
+        return evaluated('real time', lost, growth, errors)
 
 
 DROPPED = re.compile(r'(\d+) samples were read and not processed \((\d+) while it ran, (\d+) at the end\)')
@@ -343,7 +343,7 @@ def simulated_time(hours: float) -> bool:
         f'samples, {blocks} blocks, {pipeline.counters.estimates} estimates, numbers wrapped past 2^32'
     )
     growth = memory[-1] - memory[min(2, len(memory) - 1)]
-    return judged('simulated time', samples - present, growth, errors)
+    return evaluated('simulated time', samples - present, growth, errors)
 
 
 def main() -> int:

@@ -42,7 +42,7 @@ from psd_deflection.devices.protocol.frames import (
     encode,
 )
 from psd_deflection.devices.source import REOPEN_S, Event, Received
-from psd_deflection.devices.udp_port import Datagrams, Judge
+from psd_deflection.devices.udp_port import Datagrams, Validator
 from psd_deflection.records import FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE, MOST_PSDS, channel_names
 from psd_deflection.rig.config import Rig
 
@@ -66,12 +66,12 @@ class ContractFrames(PortSource):
         self._given = rig.acquisition.port
         self._baud = rig.acquisition.baud
         self._psds = len(rig.psds)
-        self.datagrams = Datagrams(self._judge)
+        self.datagrams = Datagrams(self._validator)
         self._decoder = FrameDecoder(self._psds)
         self._early: list[Event] = []
         self._next_candidate = 0
 
-    def _judge(self) -> Judge:
+    def _validator(self) -> Validator:
         """Whether a sender of datagrams speaks our frames."""
         decoder = FrameDecoder(self._psds)
         return lambda piece: any(not isinstance(frame, BadFrame) for frame in decoder.feed(piece))

@@ -43,7 +43,7 @@ from psd_deflection.devices.protocol.text_lines import (
     with_check,
 )
 from psd_deflection.devices.source import Event, Received, Sample
-from psd_deflection.devices.udp_port import Datagrams, Judge
+from psd_deflection.devices.udp_port import Datagrams, Validator
 from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.records import FLAG_OVER_RANGE, MOST_PSDS, channel_names
 from psd_deflection.rig.config import Rig
@@ -55,7 +55,7 @@ BOOT_S = 4.0
 """An Arduino restarts when its port is opened, and its boot loader takes two seconds."""
 
 
-def _judge() -> Judge:
+def _validator() -> Validator:
     """Whether a sender of datagrams speaks text lines."""
     decoder = LineDecoder()
     return lambda piece: any(not isinstance(item, BadFrame) for item in decoder.feed(piece))
@@ -65,7 +65,7 @@ class TextLines(PortSource):
     """``source: lines``."""
 
     # A line without a check that was put together of two datagrams may be of two lines, and nobody would see it.
-    datagrams = Datagrams(_judge, end=b'\n')
+    datagrams = Datagrams(_validator, end=b'\n')
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig.acquisition.port)

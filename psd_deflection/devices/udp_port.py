@@ -52,18 +52,18 @@ MOST_DATAGRAMS = 256
 MOST_PENDING = 512
 """Bytes that wait for a sender to whom they go."""
 
-Judge = Callable[[bytes], bool]
+Validator = Callable[[bytes], bool]
 """Fed with one sender's bytes in turn: whether they make something of the device's protocol."""
 
 
 @dataclass(frozen=True, slots=True)
 class Datagrams:
-    """What a source wants of datagrams. ``judge``: makes a :data:`Judge` for a new sender.
+    """What a source wants of datagrams. ``validator``: makes a :data:`Validator` for a new sender.
 
     ``end``: bytes that end each datagram, so that nothing is put together of two; empty: they are one stream.
     """
 
-    judge: Callable[[], Judge] = lambda: lambda piece: True
+    validator: Callable[[], Validator] = lambda: lambda piece: True
     end: bytes = b''
 
 
@@ -145,7 +145,7 @@ class UdpPort(OpenPort):
         if found is None:
             while len(self._candidates) >= MOST_SENDERS:
                 del self._candidates[next(iter(self._candidates))]
-            found = self._candidates[sender] = _Candidate(self._datagrams.judge())
+            found = self._candidates[sender] = _Candidate(self._datagrams.validator())
         return found
 
     def _other(self, datagram: bytes, sender: Any, now: float) -> None:
@@ -205,14 +205,14 @@ class UdpPort(OpenPort):
 class _Candidate:
     """Somebody who may be the sender. ``kept``: the last bytes that it sent."""
 
-    def __init__(self, judge: Judge) -> None:
+    def __init__(self, validator: Validator) -> None:
         self.kept = b''
-        self._judge = judge
+        self._validator = validator
 
     def takes(self, datagram: bytes) -> bool:
         """Whether it is the device's protocol, with ``datagram``."""
         self.kept = (self.kept + datagram)[-max(KEPT, len(datagram)) :]
-        return self._judge(datagram)
+        return self._validator(datagram)
 
 
 def _bound(address: Address) -> socket.socket:

@@ -174,7 +174,7 @@ class OpticsHealth:
         """Blocks in a row without change, per PSD, with this block; ``before``: without it."""
         return tuple([n + 1 if same else 0 for n, same in zip(before, self.still(measures), strict=True)])
 
-    def judge(self, block: SampleBlock, measures: BlockMeasures, frozen: tuple[int, ...]) -> Verdict:
+    def classify(self, block: SampleBlock, measures: BlockMeasures, frozen: tuple[int, ...]) -> Verdict:
         """The block's verdict, causes before consequences.
 
         ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.

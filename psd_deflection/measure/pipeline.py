@@ -351,7 +351,7 @@ class Pipeline:
             volts = [self._calibration.observed(block.volts) for block in blocks]
             samples = [self._dots(block, own) for block, own in zip(blocks, volts, strict=True)]
             measures = measured(volts, samples)
-            observed = list(self._judged(blocks, measures))
+            observed = list(self._classified(blocks, measures))
             fits = self.estimation.fits(observed)
             done = 0
             for own in zip(blocks, measures, observed, strict=True):
@@ -394,7 +394,7 @@ class Pipeline:
         yield self.last_spots
         yield block
 
-    def _judged(self, blocks: Iterable[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[ValidBlock]:
+    def _classified(self, blocks: Iterable[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[ValidBlock]:
         """The dots of each block, and whether lasers and detectors are sound."""
         frozen = self._stillness.blocks
         for block, own in zip(blocks, measures, strict=True):
@@ -406,7 +406,7 @@ class Pipeline:
                 samples=own.samples,
                 means=own.means,
                 mean_sums=own.mean_sums,
-                verdict=self._optics.judge(block, own, frozen),
+                verdict=self._optics.classify(block, own, frozen),
                 frozen=frozen,
                 due=block.index % self.rig.estimator.decimation == 0,
             )

@@ -354,7 +354,7 @@ class Watch:
             self._base_lines(lines, pose, began_ns, n)
         if still and held and self.load is not None:
             self._held_readings(readings, pose, off, began_ns, n)
-        self._judge(t_ns)
+        self._evaluate(t_ns)
 
     def _base_lines(self, windows: Sequence[_Window], pose: list[float], began_ns: int, blocks: int) -> None:
         for channel, window in zip(self._lines, windows, strict=True):
@@ -397,7 +397,7 @@ class Watch:
             self._raise(Alarm(self.load.t_ns, began_ns + self._window_ns, worst[1], worst[2], worst[3]))
             self._lasting = True
 
-    def _judge(self, t_ns: int) -> None:
+    def _evaluate(self, t_ns: int) -> None:
         beyond = [c for c in (*self._readings, *self._lines) if c.beyond]
         if self.alarm is not None:
             # It lasts until the readings are back for a while under the same load, or until the zero is taken.

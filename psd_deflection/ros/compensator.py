@@ -64,7 +64,7 @@ from psd_deflection.ros.topics import (
     SCALING,
 )
 from psd_deflection.run.diagnostics import ERROR, OK, WARN
-from psd_deflection.run.repeats import RateLimitedLog
+from psd_deflection.run.rate_limited_log import RateLimitedLog
 from psd_deflection.run.signals import StopRequestedError
 
 NODE_NAME = 'compensator'

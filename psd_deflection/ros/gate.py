@@ -31,7 +31,7 @@ from psd_deflection.base.sanitize import sanitize
 from psd_deflection.ros.actions import FAILURES, GuardedClient, GuardedServer
 from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, rejected_qos
 from psd_deflection.ros.topics import HEARD, MOST_GOALS, SERVED, GraphTopic
-from psd_deflection.run.repeats import RateLimitedLog
+from psd_deflection.run.rate_limited_log import RateLimitedLog
 
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""

@@ -33,7 +33,7 @@ from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import JOINT_STATES, SHAPED, TRAJECTORY
 from psd_deflection.run.diagnostics import OK, STALE, WARN
-from psd_deflection.run.repeats import RateLimitedLog
+from psd_deflection.run.rate_limited_log import RateLimitedLog
 
 NODE_NAME = 'shaper'
 NEWS = 6

@@ -120,7 +120,7 @@ class AlarmOut:
             for name, way in self._ways:
                 try:
                     way(text)
-                except _NotHandedOnError as error:
+                except _NotForwardedError as error:
                     self._fail(name, str(error))
                 else:
                     self.sent += 1
@@ -134,7 +134,7 @@ class AlarmOut:
             self._log(f'watch: {name}: {why}; an alarm was not handed on, and further ones are counted', WARNING)
 
 
-class _NotHandedOnError(Exception):
+class _NotForwardedError(Exception):
     """Why one alarm was not handed on."""
 
 
@@ -185,19 +185,19 @@ def _run(argv: list[str], text: bytes) -> None:
     try:
         process = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True)
     except OSError as error:
-        raise _NotHandedOnError(f'cannot be started ({error.strerror or error})') from None
+        raise _NotForwardedError(f'cannot be started ({error.strerror or error})') from None
     try:
         # A command that reads nothing is no failure.
         process.communicate(text, timeout=COMMAND_S)
     except subprocess.TimeoutExpired:
-        raise _NotHandedOnError(f'did not end within {COMMAND_S:g} s, and was killed') from None
+        raise _NotForwardedError(f'did not end within {COMMAND_S:g} s, and was killed') from None
     finally:
         # Also what it left behind.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     if process.returncode:
-        raise _NotHandedOnError(f'ended with status {process.returncode}')
+        raise _NotForwardedError(f'ended with status {process.returncode}')
 
 
 def _post(address: str, text: bytes, ending: threading.Event) -> None:
@@ -213,7 +213,7 @@ def _post(address: str, text: bytes, ending: threading.Event) -> None:
             reason = getattr(error, 'reason', error)
             why, again = f'cannot be reached ({getattr(reason, "strerror", None) or reason})', True
         if not again or pause is None or ending.wait(pause):
-            raise _NotHandedOnError(why)
+            raise _NotForwardedError(why)
 
 
 def _utc(t_ns: int) -> str:

@@ -29,10 +29,10 @@ from psd_deflection.rig.config import Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.rig.declarations import ZEROS
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.processing import Processing, RecordSink
+from psd_deflection.run.rate_limited_log import RateLimitedLog
 from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.realtime import lock_memory
 from psd_deflection.run.recorder import Recorder
-from psd_deflection.run.repeats import RateLimitedLog
 from psd_deflection.run.session_texts import ANEW, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.run.watcher import Watcher, WatcherSink

@@ -15,9 +15,9 @@ import pytest
 import serial
 
 from bench.campaign import fuzz, soak
-from bench.campaign.crash import judge, left_by_a_kill
+from bench.campaign.crash import evaluate, left_by_a_kill
 from bench.campaign.faults import Row, report
-from bench.campaign.fuzz import GRAMMARS, TARGETS, corrupted, judged
+from bench.campaign.fuzz import GRAMMARS, TARGETS, corrupted, evaluated
 from bench.campaign.kinds import FAULTS
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
 from psd_deflection.base.log import null_log
@@ -58,7 +58,7 @@ def recording_rig(line: Line, tmp_path: Path) -> Rig:
 def test_what_a_kill_leaves_is_whole(recording_rig: Rig, tmp_path: Path, after_s: float) -> None:
     """What it costs is bounded in log time (test_recover); here a busy machine may add to it."""
     folder, killed_ns = left_by_a_kill(recording_rig, tmp_path / 'bags', after_s)
-    assert judge(folder, killed_ns) > 0.0
+    assert evaluate(folder, killed_ns) > 0.0
 
 
 def test_a_sample_is_known_again_by_its_volts() -> None:
@@ -163,33 +163,33 @@ def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixt
 def test_any_choice_within_a_grammar_is_answered(name: str) -> None:
     target, seeds = TARGETS[name]()
     chance = random.Random(7)
-    rejected = [judged(target, c) for c in [*seeds, b'', *(chance.randbytes(200) for _ in range(10))]]
+    rejected = [evaluated(target, c) for c in [*seeds, b'', *(chance.randbytes(200) for _ in range(10))]]
     assert any(rejected)
 
 
 @pytest.mark.parametrize('name', [n for n in TARGETS if n not in GRAMMARS])
 def test_fuzz_targets_take_what_is_good_and_reject_what_was_found_bad(name: str) -> None:
     target, seeds = TARGETS[name]()
-    assert judged(target, seeds[0]) == []
-    assert judged(target, b'\x00\x03nonsense\x00') != []
+    assert evaluated(target, seeds[0]) == []
+    assert evaluated(target, b'\x00\x03nonsense\x00') != []
     chance = random.Random(5)
     for seed in [*seeds, b'', *(p.read_bytes() for p in FOUND if p.name.startswith(name))]:
-        judged(target, seed)
+        evaluated(target, seed)
         for _ in range(5):
             spoiled = bytearray(seed or b'\x00')
             spoiled[chance.randrange(len(spoiled))] ^= 1 << chance.randrange(8)
-            judged(target, bytes(spoiled))
+            evaluated(target, bytes(spoiled))
 
 
 def test_a_hang_and_a_rejection_of_two_lines_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert judged(lambda content: ['rejected'], b'') == ['rejected']
+    assert evaluated(lambda content: ['rejected'], b'') == ['rejected']
     with pytest.raises(AssertionError, match='more than one line'):
-        judged(lambda content: ['rejected\nat length'], b'')
+        evaluated(lambda content: ['rejected\nat length'], b'')
     monkeypatch.setattr(fuzz, 'HANG_S', -1.0)
     for name in ('frames', 'hello', 'csv', 'yaml'):
         target, seeds = TARGETS[name]()
         with pytest.raises(AssertionError, match='for one input'):
-            judged(target, seeds[0])
+            evaluated(target, seeds[0])
 
 
 def test_damaged_frames_are_rejected(capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,7 @@ def test_an_answer_is_right_if_angle_and_times_are(
     tmp_path: Path, changed: dict[str, object], message: list[str]
 ) -> None:
     (tmp_path / 'result.json').write_text(json.dumps({**RIGHT, **changed}))
-    assert day.judged(tmp_path, 0.02, LATE) == message
+    assert day.evaluated(tmp_path, 0.02, LATE) == message
     if not changed:
-        (wrong,) = day.judged(tmp_path, 0.021, LATE)
+        (wrong,) = day.evaluated(tmp_path, 0.021, LATE)
         assert wrong.startswith('angle')

@@ -11,7 +11,7 @@ import pytest
 
 from blind import law_forms
 from blind.cases import designs, gap_of
-from blind.laws import drawn, judged, observe, sized, summary
+from blind.laws import drawn, evaluated, observe, sized, summary
 from psd_deflection.studies.discover.laws.laws import find_law
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
@@ -56,16 +56,16 @@ def reported(**law: Any) -> dict[str, Any]:
 
 def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
     truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
-    row = judged(truth, reported())
+    row = evaluated(truth, reported())
     assert (row['stage'], row['variables'], row['kind'], row['set']) == (True, True, True, 1)
     assert row['floors'] == pytest.approx(1.1)
     tie = {'stage': 'psd', 'variables': ['x1']}
-    row = judged(truth, reported(stage='optics', variables=['y1'], equivalent=[tie]))
+    row = evaluated(truth, reported(stage='optics', variables=['y1'], equivalent=[tie]))
     assert (row['stage'], row['stage_alone'], row['variables'], row['variables_alone']) == (True, False, True, False)
-    row = judged(truth, {**reported(), 'unknown': [{'law': None}]})
+    row = evaluated(truth, {**reported(), 'unknown': [{'law': None}]})
     assert (row['stage'], row['variables'], row['law'], row['floors']) == (False, False, None, pytest.approx(5.0))
-    assert judged(None, reported())['alarm']
-    assert not judged(None, {**reported(), 'unknown': []})['alarm']
+    assert evaluated(None, reported())['alarm']
+    assert not evaluated(None, {**reported(), 'unknown': []})['alarm']
 
 
 def test_a_law_that_never_acts_is_drawn_anew() -> None:
@@ -77,7 +77,7 @@ def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
     truth = {**law_forms.draw(1, 'optics', 'events'), 'where': 'x2', 'times': [5.4, 9.0], 'gap': 9.0}
     found = [{'name': 'jump', 'where': 'psd_2', 'value': t} for t in (9.002, 5.399)]
     nothing = {**reported(), 'unknown': [], 'verdict': 'nothing_missing'}
-    row = judged(truth, {**nothing, 'setup': found})
+    row = evaluated(truth, {**nothing, 'setup': found})
     assert (row['stage'], row['variables'], row['stage_alone'], row['jumps']) == (True, True, False, True)
     wrong = [
         [],
@@ -87,10 +87,10 @@ def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
         [found[0], {**found[1], 'value': 5.3}],
     ]
     for message in wrong:
-        row = judged(truth, {**nothing, 'setup': message})
+        row = evaluated(truth, {**nothing, 'setup': message})
         assert (row['stage'], row['variables'], row['jumps']) == (False, False, False)
     for other in ({'where': 'load_fx'}, {'form': 'gain_events'}):
-        assert not judged({**truth, **other}, {**nothing, 'setup': found})['jumps']
+        assert not evaluated({**truth, **other}, {**nothing, 'setup': found})['jumps']
 
 
 def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -> None:
@@ -98,7 +98,7 @@ def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -
     truth = {**truth, 'size': 0.5}
     found = [{'name': 'load_value', 'where': 'load 6', 'value': [30.0, 0.57, 0.0]}]
     nothing = {**reported(), 'unknown': [], 'verdict': 'nothing_missing'}
-    row = judged(truth, {**nothing, 'setup': found})
+    row = evaluated(truth, {**nothing, 'setup': found})
     assert (row['stage'], row['variables'], row['stage_alone'], row['note']) == (True, True, False, True)
     # Under forces along y it acts at five of the noted loads.
     several = {**truth, 'of': ['load_fy'], 'where': 'load_fx', 'at': 0.1, 'sign': -1.0}
@@ -108,14 +108,14 @@ def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -
         (truth, [{**found[0], 'where': 'load 7'}]),
         (several, found),
     ):
-        row = judged(law, {**nothing, 'setup': message})
+        row = evaluated(law, {**nothing, 'setup': message})
         assert (row['stage'], row['note']) == (False, False)
-    assert not judged(truth, {**reported(stage='psd'), 'setup': found})['note']
+    assert not evaluated(truth, {**reported(stage='psd'), 'setup': found})['note']
 
 
 def test_a_threshold_that_is_missed_is_reported() -> None:
     truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
-    good = {**judged(truth, reported()), 'seconds': 1.0}
+    good = {**evaluated(truth, reported()), 'seconds': 1.0}
     assert summary([good] * 10) == (summary([good] * 10)[0], True)
     assert not summary([good] * 8 + [{**good, 'stage': False}] * 2)[1]
     assert not summary([good] * 7 + [{**good, 'floors': 1.3}] * 3)[1]

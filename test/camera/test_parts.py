@@ -16,7 +16,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs.find_discs import find_discs
-from psd_deflection.camera.discs.rim_judge import sectors_of
+from psd_deflection.camera.discs.rim_classifier import sectors_of
 from psd_deflection.camera.discs.rim_model import Shape, moved, turned
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.image_size import declared_size

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psd_deflection.camera.discs.rim_judge import Judge
+from psd_deflection.camera.discs.rim_classifier import RimClassifier
 from psd_deflection.camera.discs.rim_model import PosePrior, expected
 from psd_deflection.records import FloatArray
 
@@ -36,9 +36,9 @@ def test_the_keystone_that_is_expected_turns_with_the_target() -> None:
 def test_discs_that_seem_to_move_together_move_in_the_plane_of_the_target() -> None:
     rotation = about(0, 0.7) @ about(1, -0.4) @ about(2, 0.2)
     lens = cast(Any, SimpleNamespace(focal=1000.0))
-    judge = Judge(lens, 640, np.array([[0.0, 0.1], [0.0, -0.1]]))
+    classifier = RimClassifier(lens, 640, np.array([[0.0, 0.1], [0.0, -0.1]]))
     shape = cast(Any, SimpleNamespace(rotation=rotation, place=np.array([0.0, 0.0, 0.5])))
-    found = judge.moved_centres(shape, 0.2)
+    found = classifier.moved_centres(shape, 0.2)
     sd = 0.2 * 0.5 / 1000.0
     own = rotation.T @ found[3:, 3:] @ rotation
     assert own == pytest.approx(np.diag([sd**2, sd**2, 0.0]), abs=1e-20)

@@ -235,7 +235,7 @@ class Datagrammed:
 def of_device(start: bytes = b'device') -> Datagrams:
     """Whoever has sent ``start`` speaks the device's protocol."""
 
-    def judge() -> Any:
+    def validator() -> Any:
         heard = bytearray()
 
         def takes(piece: bytes) -> bool:
@@ -244,7 +244,7 @@ def of_device(start: bytes = b'device') -> Datagrams:
 
         return takes
 
-    return Datagrams(judge)
+    return Datagrams(validator)
 
 
 @pytest.fixture

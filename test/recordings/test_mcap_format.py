@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Channel as JudgesChannel
-from mcap.records import Metadata as JudgesMetadata
-from mcap.records import Schema as JudgesSchema
+from mcap.records import Channel as OracleChannel
+from mcap.records import Metadata as OracleMetadata
+from mcap.records import Schema as OracleSchema
 from mcap.writer import CompressionType, Writer
 
 from psd_deflection.recordings.mcap_format import RECORD_HEAD, Channel, Metadata, Opcode, Schema, parsed
@@ -41,15 +41,15 @@ CALLS = st.lists(
 )
 
 
-def judged(record: Schema | Channel | Metadata) -> bytes:
+def by_oracle(record: Schema | Channel | Metadata) -> bytes:
     """The judge's bytes of a record."""
     builder = RecordBuilder()
     if isinstance(record, Schema):
-        JudgesSchema(**record._asdict()).write(builder)
+        OracleSchema(**record._asdict()).write(builder)
     elif isinstance(record, Metadata):
-        JudgesMetadata(**record._asdict()).write(builder)
+        OracleMetadata(**record._asdict()).write(builder)
     else:
-        JudgesChannel(
+        OracleChannel(
             id=record.id,
             topic=record.topic,
             message_encoding=record.encoding,
@@ -61,7 +61,7 @@ def judged(record: Schema | Channel | Metadata) -> bytes:
 
 @given(SCHEMAS | CHANNELS | METADATA)
 def test_a_record_has_the_bytes_of_the_judge_and_comes_back(record: Schema | Channel | Metadata) -> None:
-    written = judged(record)
+    written = by_oracle(record)
     assert record.content() == written[RECORD_HEAD.size :]
     assert parsed(written[0], record.content()) == record
 
@@ -71,7 +71,7 @@ def test_a_record_that_ends_too_early_is_damaged(record: Schema | Channel | Meta
     content = record.content()
     cut = content[: data.draw(st.integers(0, len(content) - 1))]
     with pytest.raises(DamagedError):
-        parsed(judged(record)[0], cut)
+        parsed(by_oracle(record)[0], cut)
 
 
 @pytest.mark.parametrize('opcode', [Opcode.SCHEMA, Opcode.METADATA])
@@ -101,9 +101,9 @@ def wrote(writer: Any, calls: list[Call]) -> None:
 def test_a_file_has_the_bytes_of_the_judge(calls: list[Call]) -> None:
     ours, theirs = io.BytesIO(), io.BytesIO()
     wrote(McapWriter(ours, io.BytesIO(), library='us'), calls)
-    judge = Writer(theirs, compression=CompressionType.ZSTD, enable_crcs=True)
-    judge.start(profile='ros2', library='us')
-    wrote(judge, calls)
+    oracle = Writer(theirs, compression=CompressionType.ZSTD, enable_crcs=True)
+    oracle.start(profile='ros2', library='us')
+    wrote(oracle, calls)
     assert ours.getvalue() == theirs.getvalue()
 
 
@@ -112,24 +112,24 @@ def test_a_recording_is_written_again_with_the_bytes_of_the_judge(bag: Path) -> 
     """Every message of the golden recordings, in chunks of some hundred."""
     ours, theirs = io.BytesIO(), io.BytesIO()
     writer = McapWriter(ours, io.BytesIO(), library='us')
-    judge = Writer(theirs, compression=CompressionType.ZSTD, enable_crcs=True)
-    judge.start(profile='ros2', library='us')
+    oracle = Writer(theirs, compression=CompressionType.ZSTD, enable_crcs=True)
+    oracle.start(profile='ros2', library='us')
     numbers: dict[int, int] = {}
     with bag.open('rb') as stream:
         for n, (schema, channel, message) in enumerate(make_reader(stream).iter_messages()):
             assert schema is not None
             if channel.id not in numbers:
-                for target in (writer, judge):
+                for target in (writer, oracle):
                     known = target.register_schema(schema.name, schema.encoding, schema.data)
                     numbers[channel.id] = target.register_channel(
                         channel.topic, channel.message_encoding, known, channel.metadata
                     )
-            for target in (writer, judge):
+            for target in (writer, oracle):
                 target.add_message(
                     numbers[channel.id], message.log_time, message.data, message.publish_time, message.sequence
                 )
                 if n % 300 == 0:
                     target.flush()
-    for target in (writer, judge):
+    for target in (writer, oracle):
         target.finish()
     assert ours.getvalue() == theirs.getvalue()

@@ -85,7 +85,7 @@ def python(program: str, *arguments: str) -> str:
 KEEP = 'import sys, pathlib; pathlib.Path(sys.argv[1]).open("a").write(sys.stdin.read())'
 
 
-def handed_on(command: str = '', webhook: str = '', times: int = 1) -> tuple[AlarmOut, list[str]]:
+def forwarded(command: str = '', webhook: str = '', times: int = 1) -> tuple[AlarmOut, list[str]]:
     logged: list[str] = []
     out = AlarmOut(command, webhook, texts(logged.append), {'device': 'abc'})
     for _ in range(times):
@@ -96,7 +96,7 @@ def handed_on(command: str = '', webhook: str = '', times: int = 1) -> tuple[Ala
 
 def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Server) -> None:
     kept = tmp_path / 'it is; $(kept)'
-    out, stated = handed_on(python(KEEP, str(kept)), server.url)
+    out, stated = forwarded(python(KEEP, str(kept)), server.url)
     expected = finding(ALARM, {'device': 'abc'})
     assert json.loads(kept.read_text()) == expected
     assert [json.loads(body) for body in server.got] == [expected]
@@ -109,12 +109,12 @@ def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Se
 
 def test_no_shell_reads_the_command(tmp_path: Path) -> None:
     kept = tmp_path / 'kept'
-    handed_on(python(KEEP, str(kept)) + f' ; touch {tmp_path}/made $(touch {tmp_path}/made)')
+    forwarded(python(KEEP, str(kept)) + f' ; touch {tmp_path}/made $(touch {tmp_path}/made)')
     assert [path.name for path in tmp_path.iterdir()] == ['kept']
 
 
 def test_a_command_that_fails_is_reported_once_and_counted() -> None:
-    out, stated = handed_on(python('import sys; sys.exit(3)'), times=3)
+    out, stated = forwarded(python('import sys; sys.exit(3)'), times=3)
     assert (out.sent, out.failed) == (0, 3)
     assert stated == [
         f'watch: command {sys.executable}: ended with status 3; an alarm was not handed on, '
@@ -141,13 +141,13 @@ def test_a_command_that_hangs_is_killed_with_what_it_started(monkeypatch: pytest
 
 
 def test_a_command_that_reads_nothing_is_no_failure() -> None:
-    out, stated = handed_on('true', times=2)
+    out, stated = forwarded('true', times=2)
     assert (out.sent, stated) == (2, [])
 
 
 def test_a_web_address_is_tried_three_times_and_again_at_the_next_alarm(server: Server) -> None:
     server.answers = [503, 500, 429, 503, 200]
-    out, stated = handed_on('', server.url, times=2)
+    out, stated = forwarded('', server.url, times=2)
     assert len(server.got) == 5
     assert (out.sent, out.failed) == (1, 1)
     assert stated == [
@@ -158,7 +158,7 @@ def test_a_web_address_is_tried_three_times_and_again_at_the_next_alarm(server: 
 @pytest.mark.parametrize('answer', [302, 404])
 def test_what_no_repetition_mends_is_tried_once_and_no_redirection_is_followed(server: Server, answer: int) -> None:
     server.answers = [answer]
-    out, _ = handed_on('', server.url)
+    out, _ = forwarded('', server.url)
     assert len(server.got) == 1
     assert (out.failed, out.failure) == (1, f'webhook at 127.0.0.1: answers {answer}')
 
@@ -166,21 +166,21 @@ def test_what_no_repetition_mends_is_tried_once_and_no_redirection_is_followed(s
 def test_a_server_that_is_away_is_reported() -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
-    out, stated = handed_on('', f'http://127.0.0.1:{port}/')
+    out, stated = forwarded('', f'http://127.0.0.1:{port}/')
     assert out.failed == 1
     assert stated[0].startswith('watch: webhook at 127.0.0.1: cannot be reached (Connection refused)')
 
 
 def test_alarms_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'MOST_WAITING', 0)
-    out, stated = handed_on('true', times=2)
+    out, stated = forwarded('true', times=2)
     assert out.failed == 2
     assert stated == ['watch: alarms: 0 wait already; an alarm was not handed on, and further ones are counted']
 
 
 def test_an_address_that_is_a_secret_stays_in_its_file(server: Server, tmp_path: Path) -> None:
     (tmp_path / 'address').write_text(f'{server.url}/secret\n')
-    out, _ = handed_on('', str(tmp_path / 'address'))
+    out, _ = forwarded('', str(tmp_path / 'address'))
     assert (len(server.got), out.sent) == (1, 1)
     (tmp_path / 'address').write_text('file:///secret')
     with pytest.raises(ConfigError) as rejected:

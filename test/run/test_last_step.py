@@ -12,7 +12,7 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.replay.engine import replayed
 from psd_deflection.records import BlockStatus, SpotMeans
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.last_step import REACH_S, RecentDots
+from psd_deflection.run.last_load_change import REACH_S, RecentDots
 
 RIG = load_rig()
 

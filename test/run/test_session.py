@@ -27,7 +27,7 @@ from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
 from psd_deflection.run.monitor.metrics import text_of
 from psd_deflection.run.monitor.shown import RejectedError, ShownSession
-from psd_deflection.run.repeats import RateLimitedLog
+from psd_deflection.run.rate_limited_log import RateLimitedLog
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice

@@ -24,7 +24,7 @@ from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import Record
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.run import behind, recorder
+from psd_deflection.run import lag, recorder
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.headless import run_until_signal
 from psd_deflection.run.session import Session
@@ -195,7 +195,7 @@ def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_
     sample: Callable[..., SampleFrame],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(behind, 'HELD_S', 0.0)
+    monkeypatch.setattr(lag, 'HELD_S', 0.0)
     logged: list[str] = []
     session, held = run_of(rig, tmp_path, logged)
     device.send_frames(*(sample(seq) for seq in range(20)))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits the picture of three discs to the pixels at their rims: one least squares for the pose of the whole target.
 
-The model is that of :mod:`.rim_model`; :mod:`.rim_judge` decides whether the fit is an answer.
+The model is that of :mod:`.rim_model`; :mod:`.rim_classifier` decides whether the fit is an answer.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
-from psd_deflection.camera.discs.rim_judge import Judge
+from psd_deflection.camera.discs.rim_classifier import RimClassifier
 from psd_deflection.camera.discs.rim_model import (
     LIGHTS,
     ROOT_2PI,
@@ -58,7 +58,7 @@ class Fitter:
         self._rows, self._columns = image_shape
         self._rays = np.ascontiguousarray(grid.reshape(-1, 2).T, dtype=np.float32)
         self._points = np.column_stack([centres, np.ones(len(centres))])
-        self._judge = Judge(lens, self._columns, centres)
+        self._classifier = RimClassifier(lens, self._columns, centres)
         self._blur = np.eye(2)
 
     def fit(
@@ -91,7 +91,7 @@ class Fitter:
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
             if (np.abs(step) < _SETTLED * deviation).all():
                 break
-        found = self._judge.pose(normal, rims, shape, step, prior, pixel_radius, full_scale)
+        found = self._classifier.pose(normal, rims, shape, step, prior, pixel_radius, full_scale)
         if motion_of(shape.blur) < _SKEW_BLUR:
             self._blur = shape.blur
         return found

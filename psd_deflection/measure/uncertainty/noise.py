@@ -286,11 +286,11 @@ class StreamNoise:
             still = np.column_stack((series[:, count:], np.concatenate(sums)))
             self.tones = self._search.tones(places, moved, still, self._moving)
         fixed = _covariance(lags[count:, count:], sure, self._xp)[0, 0]
-        self._judge(lags[:count, :count], sure, fixed, rough + self._least())
+        self._classify(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()
         return True
 
-    def _judge(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
+    def _classify(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
         """``gamma``, ``sure``: as measured, of a segment. ``fixed`` (N,): of the combination that does not move.
 
         ``rough``: of the combinations that move, the readings and the combination that does not, m^2.

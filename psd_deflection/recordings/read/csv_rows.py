@@ -53,7 +53,7 @@ class SampleRows(CsvTable):
         last, line = -1, 0
         try:
             with self.path.open('rb') as stream:
-                begin = self._behind_header(stream)
+                begin = self._after_header(stream)
                 if begin:
                     line, at = self.header_line, begin
                     for size, rows in self._plain(stream):
@@ -70,7 +70,7 @@ class SampleRows(CsvTable):
             raise self.reject(f'cannot be read ({error.strerror or error})') from None
         yield from self._any(begin, line, last)
 
-    def _behind_header(self, stream: BinaryIO) -> int:
+    def _after_header(self, stream: BinaryIO) -> int:
         """Bytes of the header if it is the first line and ends with a newline, else 0; ``stream`` is there then."""
         first = stream.readline(MAX_LINE + 1)
         if self.header_line != 1 or not first.endswith(b'\n') or b'\r' in first.removesuffix(b'\r\n'):

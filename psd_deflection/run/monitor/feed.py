@@ -30,7 +30,7 @@ from psd_deflection.rig.declarations import ZEROS
 QUEUE_ITEMS = 2000
 """Ten seconds at 100 blocks/s and two items per block."""
 
-_BEHIND = (
+_LAG = (
     'dx',
     'dy',
     'theta',
@@ -46,7 +46,7 @@ _BEHIND = (
 
 def row_columns(psds: int) -> tuple[str, ...]:
     """Columns of a row on the page: s, -, m, V, m, rad, their standard deviations, samples, BlockStatus, chi-square."""
-    return ('t', 'block', *dot_names(psds), *(f'sum{n}' for n in range(1, psds + 1)), *_BEHIND)
+    return ('t', 'block', *dot_names(psds), *(f'sum{n}' for n in range(1, psds + 1)), *_LAG)
 
 
 COLUMNS = row_columns(2)

@@ -37,14 +37,14 @@ from psd_deflection.records import (
     RawChunk,
 )
 from psd_deflection.rig.config import Rig
-from psd_deflection.run.behind import SLOW
+from psd_deflection.run.lag import SLOW
+from psd_deflection.run.rate_limited_log import RateLimitedLog
 from psd_deflection.run.reading.arrivals import Annotation, Arrival, Ended, ItemQueue, Restarted, SampleBuffer
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
 from psd_deflection.run.reading.pinger import Pinger
 from psd_deflection.run.realtime import prefer_reader
-from psd_deflection.run.repeats import RateLimitedLog
 
 SILENCE_S = 2.0
 """A device that sends no sample for this long is reported, and asked for samples again."""

@@ -218,10 +218,10 @@ def verdict_of(as_found: FloatArray, uncertainty: FloatArray, limits: FloatArray
 
     It does not conform if |error| - U is beyond the limit on any axis.
     """
-    return Conformity(*(_judged(np.abs(error), uncertainty, limits) for error in (as_found, np.zeros(3))))
+    return Conformity(*(_verdict(np.abs(error), uncertainty, limits) for error in (as_found, np.zeros(3))))
 
 
-def _judged(error: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> str:
+def _verdict(error: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> str:
     if bool((error + uncertainty <= limits).all()):
         return CONFORMS
     return FAILS if bool((error - uncertainty > limits).any()) else OPEN

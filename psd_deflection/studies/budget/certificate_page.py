@@ -177,17 +177,17 @@ class Certified(StudyResult):
 
     def result_rows(self) -> list[list[str]]:
         """Return the head first."""
-        judged = self.verdicts
+        classified = self.verdicts
         head = ['pose', *UNITS, *(f'as found {u}' for u in UNITS), *(f'u_c {u}' for u in UNITS)]
         head += [f'ν_eff {a}' for a in SYMBOLS] + [f'k {a}' for a in SYMBOLS] + [f'U {u}' for u in UNITS]
-        rows = [head + (['as found', 'as left'] if judged else [])]
+        rows = [head + (['as found', 'as left'] if classified else [])]
         for n, (pose, error, uncertainty) in enumerate(
             zip(self.found.poses, self.found.found, self.found.stated, strict=True)
         ):
             row = [str(n + 1), *display_values(pose), *display_values(error), *display_values(uncertainty.standard)]
             row += map(freedom_words, uncertainty.freedom.tolist())
             row += [f'{k:.3f}' for k in uncertainty.factor.tolist()] + display_values(uncertainty.uncertainty)
-            rows.append(row + (list(judged[n]) if judged else []))
+            rows.append(row + (list(classified[n]) if classified else []))
         return rows
 
     def chart(self) -> Chart:

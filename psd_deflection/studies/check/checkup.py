@@ -13,16 +13,16 @@ import numpy as np
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.judges import (
+from psd_deflection.studies.check.levels import SUM_FACTOR, Levels, levels
+from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, SIGNIFICANT_DRIFT, WRONG, Checkup, Finding
+from psd_deflection.studies.check.shared_findings import (
     noise_findings,
     note_finding,
     step_findings,
     unit_findings,
     wiring_findings,
 )
-from psd_deflection.studies.check.levels import SUM_FACTOR, Levels, levels
-from psd_deflection.studies.check.responses import responses
-from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, SIGNIFICANT_DRIFT, WRONG, Checkup, Finding
 from psd_deflection.studies.check.wirings import (
     DOTS,
     LIMIT,

@@ -17,7 +17,7 @@ from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.check.judges import noise_findings, step_findings
+from psd_deflection.studies.check.shared_findings import noise_findings, step_findings
 from psd_deflection.studies.discover.free_loads import searched
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation

@@ -48,7 +48,7 @@ class DotStep:
     lost: int = 0
 
 
-def last_step(rig: Rig, dots: FloatArray, period: float) -> float | None:
+def last_load_change(rig: Rig, dots: FloatArray, period: float) -> float | None:
     """When the last lasting step of ``dots`` (n, 2P), m, was, s from the first of them; None if they have none.
 
     ``period``: s from one to the next; they may be means of blocks. The time is that of the step's middle, to a

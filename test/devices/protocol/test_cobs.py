@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-import cobs.cobs as judge
+import cobs.cobs as oracle
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +19,7 @@ PAYLOADS = st.binary(max_size=600) | st.lists(RUNS, max_size=4).map(lambda runs:
 @given(PAYLOADS)
 def test_any_payload_is_encoded_as_the_judge_does_and_comes_back(payload: bytes) -> None:
     encoded = encode(payload)
-    assert encoded == judge.encode(payload)
+    assert encoded == oracle.encode(payload)
     assert 0 not in encoded
     assert decode(encoded) == payload
 
@@ -27,8 +27,8 @@ def test_any_payload_is_encoded_as_the_judge_does_and_comes_back(payload: bytes)
 @given(st.binary(max_size=600) | PAYLOADS.map(encode).map(lambda whole: whole[:-1]))
 def test_any_bytes_are_decoded_or_rejected_as_the_judge_does(encoded: bytes) -> None:
     try:
-        expected = judge.decode(encoded)
-    except judge.DecodeError:
+        expected = oracle.decode(encoded)
+    except oracle.DecodeError:
         with pytest.raises(ValueError, match='not COBS'):
             decode(encoded)
     else:
@@ -38,5 +38,5 @@ def test_any_bytes_are_decoded_or_rejected_as_the_judge_does(encoded: bytes) -> 
 def test_the_blocks_around_254_bytes() -> None:
     for size in range(250, 514):
         for payload in (b'a' * size, b'a' * size + b'\0', b'\0' + b'a' * size, b'a' * size + b'\0b'):
-            assert encode(payload) == judge.encode(payload)
+            assert encode(payload) == oracle.encode(payload)
             assert decode(encode(payload)) == payload

@@ -43,16 +43,16 @@ def operation() -> motion.Run:
 
 
 @pytest.fixture(scope='module')
-def judged() -> dict[str, motion.Result]:
+def evaluated() -> dict[str, motion.Result]:
     # A joint rests most of the time.
     seconds = dict.fromkeys(motion.KINDS, 7.0) | {'joint': 11.0}
-    return {kind: motion.judge(motion.make(kind, seconds[kind], 2), RIG) for kind in motion.KINDS}
+    return {kind: motion.evaluate(motion.make(kind, seconds[kind], 2), RIG) for kind in motion.KINDS}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('kind', motion.KINDS)
-def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion.Result]) -> None:
-    for axis in motion.figures([judged[kind]]):
+def test_velocity_prediction_and_innovations(kind: str, evaluated: dict[str, motion.Result]) -> None:
+    for axis in motion.figures([evaluated[kind]]):
         assert axis.velocity < 0.2 * axis.smoothed
         assert axis.velocity < 1.1 * axis.own
         # What is told of a base is a mean over some samples.
@@ -61,8 +61,8 @@ def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion
 
 
 @pytest.mark.slow
-def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(judged: dict[str, motion.Result]) -> None:
-    swept = judged['chirp']
+def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(evaluated: dict[str, motion.Result]) -> None:
+    swept = evaluated['chirp']
     # The frequency rises with time, from 0.5 Hz to 1.2 times that of the mode.
     for predicted, held in zip(np.array_split(swept.predicted, 8), np.array_split(swept.held, 8), strict=True):
         assert np.all(np.square(predicted).mean(axis=0) < 0.9 * np.square(held).mean(axis=0))
@@ -103,8 +103,8 @@ def test_without_samples_for_100_ms_the_truth_is_within_three_deviations(operati
 
 @pytest.mark.slow
 @pytest.mark.parametrize('kind', motion.KINDS)
-def test_100_ms_later_the_truth_is_within_three_deviations(kind: str, judged: dict[str, motion.Result]) -> None:
-    unseen = judged[kind].unseen
+def test_100_ms_later_the_truth_is_within_three_deviations(kind: str, evaluated: dict[str, motion.Result]) -> None:
+    unseen = evaluated[kind].unseen
     assert np.all(np.mean(np.abs(unseen[np.isfinite(unseen[:, 0])]) < 3.0, axis=0) > 0.97)
 
 

@@ -27,7 +27,7 @@ def of(volts: npt.NDArray[np.float32], dots: tuple[float, ...] = ()) -> BlockMea
     return measured([volts.astype(np.float32)], [samples])[0]._replace(means=dots)
 
 
-def judge(
+def classify(
     volts: tuple[float, ...] = GOOD,
     dots: tuple[float, ...] = DOTS,
     *,
@@ -46,7 +46,7 @@ def judge(
     flags[3] = flag
     seq = np.arange(present)
     block = SampleBlock(0, seq, seq * 1_000_000, rows, flags)
-    return OpticsHealth(rig).judge(block, of(rows, dots), frozen)
+    return OpticsHealth(rig).classify(block, of(rows, dots), frozen)
 
 
 def changed(i: int, value: float) -> tuple[float, ...]:
@@ -54,19 +54,19 @@ def changed(i: int, value: float) -> tuple[float, ...]:
 
 
 def test_a_good_block_is_good() -> None:
-    assert judge() == Verdict(BlockStatus.OK, '', 0)
+    assert classify() == Verdict(BlockStatus.OK, '', 0)
 
 
 @pytest.mark.parametrize(('psd', 'channel'), [(1, 2), (2, 5)])
 def test_a_laser_is_lost_below_the_least_sum_even_in_one_sample(psd: int, channel: int) -> None:
     least = load_rig().estimator.sum_min
-    lost = judge(one=changed(channel, least - 0.001))
+    lost = classify(one=changed(channel, least - 0.001))
     assert (lost.status, lost.faulty, lost.faults) == (BlockStatus.LASER_LOST, psd, frozenset({psd}))
     assert lost.reason == f'laser {psd} lost: sum {least - 0.001:.3f} V, below {least:g} V'
-    assert judge(one=changed(channel, least + 0.001)).status is BlockStatus.OK
+    assert classify(one=changed(channel, least + 0.001)).status is BlockStatus.OK
     # Half of it if two lasers share the detectors.
-    assert judge(one=changed(channel, 0.5 * least + 0.001), splitter=True).status is BlockStatus.OK
-    assert judge(one=changed(channel, 0.5 * least - 0.001), splitter=True).faulty == psd
+    assert classify(one=changed(channel, 0.5 * least + 0.001), splitter=True).status is BlockStatus.OK
+    assert classify(one=changed(channel, 0.5 * least - 0.001), splitter=True).faulty == psd
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
@@ -75,33 +75,33 @@ def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, s
     if channel in (2, 5) and sign < 0.0:
         return
     name = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')[channel]
-    full = judge(one=changed(channel, sign * 32767 * STEP))
+    full = classify(one=changed(channel, sign * 32767 * STEP))
     assert (full.status, full.faulty) == (BlockStatus.SATURATED, 1 + channel // 3)
     assert full.reason == f'{name} saturated: 10.000 V, converter.full_scale is 10 V'
-    assert judge(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
+    assert classify(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
 
 
 def test_the_devices_flag_blames_no_detector_unless_a_cause_is_observed() -> None:
-    reported = judge(flag=FLAG_OVER_RANGE)
+    reported = classify(flag=FLAG_OVER_RANGE)
     assert (reported.status, reported.faulty) == (BlockStatus.SATURATED, 0)
-    assert judge(changed(2, 0.0), flag=FLAG_OVER_RANGE).status is BlockStatus.LASER_LOST
+    assert classify(changed(2, 0.0), flag=FLAG_OVER_RANGE).status is BlockStatus.LASER_LOST
 
 
 @pytest.mark.parametrize(('blocks', 'status'), [(4, BlockStatus.OK), (5, BlockStatus.FROZEN)])
 def test_a_detector_is_frozen_after_five_blocks_if_that_is_to_be_rejected(blocks: int, status: BlockStatus) -> None:
     for psd, frozen in ((1, (blocks, 0)), (2, (0, blocks))):
-        got = judge_frozen(frozen)
+        got = classify_frozen(frozen)
         assert got.status is status
         assert got.faulty == (psd if status is BlockStatus.FROZEN else 0)
-        assert judge(frozen=frozen).status is BlockStatus.OK
+        assert classify(frozen=frozen).status is BlockStatus.OK
 
 
-def judge_frozen(frozen: tuple[int, int]) -> Verdict:
+def classify_frozen(frozen: tuple[int, int]) -> Verdict:
     rig = load_rig()
     rig = dataclasses.replace(rig, estimator=dataclasses.replace(rig.estimator, frozen='reject'))
     rows = np.tile(np.array(GOOD, np.float32), (20, 1))
     block = SampleBlock(0, np.arange(20), np.arange(20) * 1_000_000, rows, np.zeros(20, np.uint8))
-    return OpticsHealth(rig).judge(block, of(rows, DOTS), frozen)
+    return OpticsHealth(rig).classify(block, of(rows, DOTS), frozen)
 
 
 @pytest.mark.parametrize('axis', range(4))
@@ -112,56 +112,56 @@ def test_a_dot_is_outside_beyond_half_the_active_area(axis: int) -> None:
         for off, status in ((1e-6, BlockStatus.OUTSIDE_ACTIVE_AREA), (-1e-6, BlockStatus.OK)):
             dots = list(DOTS)
             dots[axis] = sign * (half + off)
-            got = judge(dots=tuple(dots), **areas)
+            got = classify(dots=tuple(dots), **areas)
             assert got.status is status
             assert got.faulty == (1 + axis // 2 if off > 0 else 0)
 
 
 def test_too_few_samples_leave_no_detector_to_go_on_with() -> None:
-    assert judge(present=10).status is BlockStatus.OK
-    few = judge(present=9)
+    assert classify(present=10).status is BlockStatus.OK
+    few = classify(present=9)
     assert (few.status, few.faulty) == (BlockStatus.TOO_FEW_SAMPLES, 0)
     assert few.reason == '9 of 20 samples, at least 10 are needed'
     # A lost laser says more; but the other detector has too few samples too.
-    dark = judge(changed(2, 0.0), present=9)
+    dark = classify(changed(2, 0.0), present=9)
     assert (dark.status, dark.faulty, dark.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1}))
 
 
 def test_the_worst_cause_is_reported_first_and_two_faults_leave_nothing() -> None:
     far = (1.0, 0.0, 1.25e-4, -1.25e-4)
-    both = judge(changed(5, 0.0), far)
+    both = classify(changed(5, 0.0), far)
     assert (both.status, both.faulty, both.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1, 2}))
     assert both.reason.startswith('laser 2')
     # Of one detector the cause, not what it causes.
-    assert judge(changed(2, 0.0), far).reason.startswith('laser 1')
-    assert judge(changed(3, 10.0), (*DOTS[:2], 1.0, 0.0)).status is BlockStatus.SATURATED
+    assert classify(changed(2, 0.0), far).reason.startswith('laser 1')
+    assert classify(changed(3, 10.0), (*DOTS[:2], 1.0, 0.0)).status is BlockStatus.SATURATED
 
 
 @pytest.mark.parametrize(('share', 'reported'), [(0.34, False), (0.36, True), (0.64, True), (0.66, False)])
 def test_half_the_light_on_both_is_one_laser_of_two(share: float, reported: bool) -> None:
     nominal = load_rig().amplifier.sum_nominal
     volts = (*GOOD[:2], share * nominal, *GOOD[3:5], share * nominal)
-    got = judge(volts, splitter=True)
+    got = classify(volts, splitter=True)
     assert got.half_light == reported
     assert any('half the light' in f for f in got.findings) == reported
-    assert not judge((*volts[:5], nominal), splitter=True).half_light
-    assert not judge(volts).half_light
+    assert not classify((*volts[:5], nominal), splitter=True).half_light
+    assert not classify(volts).half_light
 
 
 def test_other_light_and_a_clipped_spot_are_reported_of_the_detector() -> None:
     most = load_rig().estimator.sum_max
     for psd, channel in ((1, 2), (2, 5)):
-        assert judge(one=changed(channel, most + 0.01)).findings == (
+        assert classify(one=changed(channel, most + 0.01)).findings == (
             f'psd_{psd} sees other light: sum {most + 0.01:.3f} V, above {most:g} V',
         )
-        assert judge(one=changed(channel, most - 0.01)).findings == ()
+        assert classify(one=changed(channel, most - 0.01)).findings == ()
     area, radius = load_rig().psds[0].active_area, load_rig().psds[0].spot_radius
     for axis in range(4):
         edge = area[axis % 2] / 2.0 - radius
         for off, reported in ((1e-6, True), (-1e-6, False)):
             dots = (*DOTS[:axis], -edge - off, *DOTS[axis + 1 :])
             message = (f'psd_{1 + axis // 2}: the spot is clipped at the edge',) if reported else ()
-            assert judge(dots=dots).findings == message
+            assert classify(dots=dots).findings == message
 
 
 def test_other_light_moves_a_dot_toward_its_own_centre_wherever_that_is() -> None:
@@ -178,30 +178,30 @@ def test_other_light_moves_a_dot_toward_its_own_centre_wherever_that_is() -> Non
 
 
 def test_what_is_exactly_at_its_limit_is_still_good() -> None:
-    assert judge(changed(2, 2.0), sum_min=2.0).status is BlockStatus.OK
-    assert judge(changed(5, 6.0), sum_max=6.0).findings == ()
+    assert classify(changed(2, 2.0), sum_min=2.0).status is BlockStatus.OK
+    assert classify(changed(5, 6.0), sum_max=6.0).findings == ()
     health = OpticsHealth(load_rig(overrides={'sum_max': 6.0}))
     assert health.background_variance((6.0,) * 2) == (0.0, 0.0)
     # One step below the last one.
-    assert judge(one=changed(0, 32766 * STEP)).status is BlockStatus.OK
+    assert classify(one=changed(0, 32766 * STEP)).status is BlockStatus.OK
     # Half of 2^-6 m, and a spot of 2^-10 m that touches the edge: doubles without rounding.
     edges: dict[str, Any] = {'psd_1.active_area': [2.0**-6] * 2, 'psd_1.spot_radius': 2.0**-10}
     for axis in (0, 1):
         touches = [0.0] * 4
         touches[axis] = 2.0**-7 - 2.0**-10
-        assert judge(dots=tuple(touches), **edges) == Verdict(BlockStatus.OK, '', 0)
+        assert classify(dots=tuple(touches), **edges) == Verdict(BlockStatus.OK, '', 0)
         touches[axis] = 2.0**-7
-        assert judge(dots=tuple(touches), **edges).status is BlockStatus.OK
+        assert classify(dots=tuple(touches), **edges).status is BlockStatus.OK
 
 
 def test_the_sound_detectors_are_those_without_a_fault_if_samples_are_enough() -> None:
-    assert judge(changed(2, 0.0)).sound == (1,)
-    assert judge(changed(5, 0.0)).sound == (0,)
-    assert judge((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).sound == ()
-    assert judge(changed(2, 0.0), present=9).sound == ()
-    assert judge(changed(2, 0.0), present=10).sound == (1,)
+    assert classify(changed(2, 0.0)).sound == (1,)
+    assert classify(changed(5, 0.0)).sound == (0,)
+    assert classify((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).sound == ()
+    assert classify(changed(2, 0.0), present=9).sound == ()
+    assert classify(changed(2, 0.0), present=10).sound == (1,)
     # Of two lost lasers the first is named.
-    assert judge((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).reason.startswith('laser 1')
+    assert classify((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).reason.startswith('laser 1')
 
 
 @pytest.mark.parametrize('channel', range(6))
@@ -271,8 +271,8 @@ def test_other_light_counts_over_each_detectors_own_area() -> None:
 
 def test_a_spot_at_a_corner_is_reported_once_and_the_faulty_psd_hides_no_other() -> None:
     corner = (*DOTS[:2], 4.9e-3, -4.9e-3)
-    assert judge(dots=corner).findings == ('psd_2: the spot is clipped at the edge',)
-    dark = judge(changed(2, 0.0), corner)
+    assert classify(dots=corner).findings == ('psd_2: the spot is clipped at the edge',)
+    dark = classify(changed(2, 0.0), corner)
     assert dark.faulty == 1
     assert dark.findings == ('psd_2: the spot is clipped at the edge',)
 

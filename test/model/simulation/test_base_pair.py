@@ -20,7 +20,7 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.config import load_rig
-from test.judges import RayPlane
+from test.oracles import RayPlane
 
 pytestmark = pytest.mark.slow
 

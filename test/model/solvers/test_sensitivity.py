@@ -76,10 +76,10 @@ def test_gain_and_covariance_are_those_of_the_answer(
     pose: tuple[float, float, float],
 ) -> None:
     solver = make_solver(method, geometry, **options)
-    judged(solver, np.asarray(rays.tip_dots(geometry, (*pose, *tilt))), 1e-5, 1e-5)
+    checked(solver, np.asarray(rays.tip_dots(geometry, (*pose, *tilt))), 1e-5, 1e-5)
 
 
-def judged(solver: Solver, dots: Array, covariance_within: float, gain_within: float) -> None:
+def checked(solver: Solver, dots: Array, covariance_within: float, gain_within: float) -> None:
     """Covariance against K V K^T and the stated gain against K, each in units of its own size."""
     variances = np.array(VARIANCES[: len(dots)])
     gain = by_differences(solver, dots, variances)
@@ -101,7 +101,7 @@ def test_the_covariance_of_beam_is_that_of_its_answer(
 ) -> None:
     """Its gain is a flat plate's, so it misses what heights do: k h/L of it."""
     dots = np.asarray(rays.tip_dots(geometry, tied(geometry, pose)))
-    judged(make_solver('beam', geometry), dots, 1e-5, gain_within)
+    checked(make_solver('beam', geometry), dots, 1e-5, gain_within)
 
 
 @pytest.mark.parametrize('assume', ['beam', 'no_twist'])

@@ -15,7 +15,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check import judges
+from psd_deflection.studies.check import shared_findings
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.levels import levels
 
@@ -48,8 +48,11 @@ def test_each_unit_has_its_factor() -> None:
     g, pound = 9.80665, 0.45359237
     force = {'kg': g, 'g': g / 1000, 'lbf': g * pound, 'kN': 1000, 'mN': 1 / 1000, 'ozf': g * pound / 16}
     torque = {'kg m': g, 'kg cm': g / 100, 'kg mm': g / 1000, 'kN m': 1000, 'N mm': 1 / 1000, 'N cm': 1 / 100}
-    for units, own, wanted in ((judges.FORCE_UNITS, 'N', force), (judges.TORQUE_UNITS, 'N m', torque)):
-        reported = {words: factor for factor, words in judges.both_ways(units, own)}
+    for units, own, wanted in (
+        (shared_findings.FORCE_UNITS, 'N', force),
+        (shared_findings.TORQUE_UNITS, 'N m', torque),
+    ):
+        reported = {words: factor for factor, words in shared_findings.both_ways(units, own)}
         there = {f'{unit} instead of {own}': factor for unit, factor in wanted.items()}
         # What is a thousand times one way is it the other way too.
         back = {
@@ -91,7 +94,7 @@ NAN = math.nan
     ],
 )
 def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float], units: dict[int, str]) -> None:
-    findings, _ = judges.unit_findings(np.array(sizes))
+    findings, _ = shared_findings.unit_findings(np.array(sizes))
     places = {'fx': 0, 'fy': 1, 'tz': 2}
     reported = {places[load]: f.fix.partition('it is noted in ')[2] for f in findings for load in f.where.split()}
     assert reported == units
@@ -132,27 +135,27 @@ def test_a_channel_within_a_coarse_step_is_not_dead() -> None:
 def test_the_noise_of_steps_is_their_size_over_the_root_of_twelve() -> None:
     stated = math.hypot(2e-3, 0.05 / math.sqrt(12.0))
     steps = np.full((2, 2), 0.05)
-    (found,), lines = judges.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)
+    (found,), lines = shared_findings.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)
     assert (found.name, found.where, found.value) == ('noise_level', 'x1 y1 x2 y2', 3.457)
     assert found.evidence == pytest.approx(math.log(3.45678))
     assert lines == {'amplifier.noise': 6.9e-3}
     assert found.fix == 'amplifier.noise: 0.0069'
     # Steps that are finer than the file's make no less.
     alone = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
-    (same,), _ = judges.noise_findings(RIG, np.full(4, 3.0 * alone), np.zeros((2, 2)))
+    (same,), _ = shared_findings.noise_findings(RIG, np.full(4, 3.0 * alone), np.zeros((2, 2)))
     assert same.value == 3.0
     # Channels that nobody sees have no say, however coarse they are.
     steps[0, 1] = 5.0
-    (some,), _ = judges.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
+    (some,), _ = shared_findings.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
     assert some.value == 3.457
-    assert judges.noise_findings(RIG, np.zeros(4)) == ([], {})
+    assert shared_findings.noise_findings(RIG, np.zeros(4)) == ([], {})
 
 
 def test_noise_of_a_channel_is_reported_with_its_factor() -> None:
     rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
     step = 20.0 / 2**16 / math.sqrt(12.0)
     noise = np.array([2.34567 * math.hypot(1e-3, step), 2e-3, 4e-3, math.hypot(2e-3, step) / 3.21])
-    findings, lines = judges.noise_findings(rig, noise)
+    findings, lines = shared_findings.noise_findings(rig, noise)
     assert [(f.name, f.where, f.value) for f in findings] == [
         ('noise_level', 'x1', 2.346),
         ('noise_level', 'y2', 0.312),
@@ -160,7 +163,7 @@ def test_noise_of_a_channel_is_reported_with_its_factor() -> None:
     assert [f.evidence for f in findings] == pytest.approx([math.log(2.34567), math.log(3.21)])
     assert lines == {'psd_1.noise': [2.4e-3, 2e-3], 'psd_2.noise': [4e-3, 6.2e-4]}
     noise[1] = math.nan
-    assert [f.where for f in judges.noise_findings(rig, noise)[0]] == ['y2']
+    assert [f.where for f in shared_findings.noise_findings(rig, noise)[0]] == ['y2']
 
 
 @pytest.mark.parametrize(
@@ -178,7 +181,7 @@ def test_noise_of_a_channel_is_reported_with_its_factor() -> None:
 )
 def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: int | None, words: str) -> None:
     rig = load_rig(overrides={'converter.bits': bits})
-    (found,), lines = judges.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]))
+    (found,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]))
     assert lines == ({} if right is None else {'converter.bits': right})
     assert (found.where, found.value) == ('sum1', step)
     assert found.evidence == pytest.approx(math.log(step / (20.0 / 2**bits)))
@@ -186,15 +189,15 @@ def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: 
     if words:
         assert found.fix == (reported if right is None else f'converter.bits: {right} ({reported})')
     # If other channels are finer, no number of bits is right for all.
-    (found,), lines = judges.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
+    (found,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
     assert lines == {}
     assert not found.fix.startswith('converter.bits')
 
 
 def test_a_unit_has_the_evidence_that_is_reported_or_none() -> None:
     sizes = np.array([9.80665, math.nan, math.nan])
-    assert judges.unit_findings(sizes)[0][0].evidence == 0.0
-    (found,), factors = judges.unit_findings(sizes, 7.0)
+    assert shared_findings.unit_findings(sizes)[0][0].evidence == 0.0
+    (found,), factors = shared_findings.unit_findings(sizes, 7.0)
     assert (found.name, found.where, found.value, found.evidence) == ('load_unit', 'fx', 9.80665, 7.0)
     assert found.fix == 'multiply load_fx in the recording by 9.80665: it is noted in kg instead of N'
     assert factors.tolist() == [9.80665, 1.0, 1.0]
@@ -202,5 +205,5 @@ def test_a_unit_has_the_evidence_that_is_reported_or_none() -> None:
 
 def test_a_turned_sign_has_the_value_minus_one_and_an_exchange_none() -> None:
     wiring = Wiring(True, (('y', 'x'), ('x', '-y')))
-    findings, _ = judges.wiring_findings(wiring, Wiring.from_rig(RIG), 0.0)
+    findings, _ = shared_findings.wiring_findings(wiring, Wiring.from_rig(RIG), 0.0)
     assert [(f.name, f.value) for f in findings] == [('psd_swap', None), ('axis_swap', None), ('channel_sign', -1.0)]

@@ -19,7 +19,7 @@ from psd_deflection.studies.loads.annotated_times import (
     correct_loads,
     unannotated_steps,
 )
-from psd_deflection.studies.loads.steps import last_step
+from psd_deflection.studies.loads.steps import last_load_change
 from test.studies.loads.test_note_parts import as_steps, note
 
 RIG = load_rig()
@@ -296,7 +296,7 @@ def annotated_at(*places: int, count: int = 20_000) -> FloatArray:
 
 def test_last_step_is_the_last_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     with_pieces(monkeypatch, as_steps((100.0, 1.0), (250.0, 1.0), (900.5, 1.0)), {})
-    assert last_step(RIG, np.zeros((1000, 4)), 0.02) == pytest.approx(18.01)
+    assert last_load_change(RIG, np.zeros((1000, 4)), 0.02) == pytest.approx(18.01)
 
 
 def test_steps_without_a_note_near_them_are_reported_by_their_fitted_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -415,6 +415,6 @@ def test_means_take_four_periods_of_bending_and_two_samples_at_least(
     loads = np.zeros((100, 3))
     loads[50:] = 1.0
     assert unannotated_steps(rig, np.zeros((100, 4)), loads) == []
-    assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
+    assert last_load_change(rig, np.zeros((100, 4)), 1.0 / rate) is None
     assert correct_loads(rig, np.zeros((100, 4)), loads) is None
     assert widths == [width] * 3

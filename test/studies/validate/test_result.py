@@ -22,7 +22,7 @@ def none(dots: FloatArray) -> FloatArray:
     return dots[:, :3]
 
 
-BEHIND = Offset(0.0123, 1e-4, 0.0, 1e-6, True, (), 100)
+LATE = Offset(0.0123, 1e-4, 0.0, 1e-6, True, (), 100)
 X = Agreement(1.5e-6, 0.25e-6, (-2.5e-6, 5.5e-6), 0.004, 0.001, 2e-6, 3e-6, 4e-6, 0.05)
 Y = Agreement(-2e-6, 0.5e-6, (-4e-6, 0.0), math.nan, math.nan, 5e-6, 6e-6, 7e-6, math.nan, mirrored=True)
 # A milliradian is 57.3 mdeg.
@@ -46,7 +46,7 @@ PLAIN = Validated(
     reference=np.arange(12.0).reshape(4, 3),
     estimates={'exact': 10.0 * np.arange(12.0).reshape(4, 3), 'wls': np.full((4, 3), math.nan)},
     agreements={'exact': (X, Y, TWIST), 'wls': (Y, X, TWIST)},
-    offset=BEHIND,
+    offset=LATE,
     applied=False,
     covered=(math.nan, math.nan, math.nan),
     excluded=0,
@@ -55,7 +55,7 @@ PLAIN = Validated(
 
 def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
     assert PLAIN.sentences() == [
-        BEHIND.sentence,
+        LATE.sentence,
         'It is not removed in what follows; --align removes it.',
         'ΔX: the estimate is +1.50 ± 0.49 µm off on average; 95 % of the differences lie between -2.5 and +5.5 µm; '
         'it is +0.400 ± 0.196 % larger.',
@@ -70,16 +70,16 @@ def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
 @pytest.mark.parametrize(
     ('offset', 'applied', 'words'),
     [
-        (BEHIND, True, 'The offset is removed in what follows.'),
-        (BEHIND, False, 'It is not removed in what follows; --align removes it.'),
-        (replace(BEHIND, value=-0.0123), False, 'It is not removed in what follows; --align removes it.'),
+        (LATE, True, 'The offset is removed in what follows.'),
+        (LATE, False, 'It is not removed in what follows; --align removes it.'),
+        (replace(LATE, value=-0.0123), False, 'It is not removed in what follows; --align removes it.'),
         # 0.19 ms with 0.1 ms of deviation is no offset, 0.2 ms is one.
-        (replace(BEHIND, value=0.2e-3), False, 'It is not removed in what follows; --align removes it.'),
-        (replace(BEHIND, value=0.19e-3), False, None),
-        (replace(BEHIND, value=-0.19e-3), False, None),
+        (replace(LATE, value=0.2e-3), False, 'It is not removed in what follows; --align removes it.'),
+        (replace(LATE, value=0.19e-3), False, None),
+        (replace(LATE, value=-0.19e-3), False, None),
         # It is large, but nobody knows how large.
-        (replace(BEHIND, explained=False), False, None),
-        (replace(BEHIND, alternatives=(0.2,)), False, None),
+        (replace(LATE, explained=False), False, None),
+        (replace(LATE, alternatives=(0.2,)), False, None),
     ],
 )
 def test_whether_the_offset_is_removed_is_reported_if_there_is_one(
@@ -137,7 +137,7 @@ def test_programs_get_si_units() -> None:
     assert offset['value'] == 0.0123
     assert offset['interval'] == pytest.approx((0.0123 - 0.196e-3, 0.0123 + 0.196e-3))
     assert (offset['determined'], offset['applied'], offset['unit']) == (True, False, 's')
-    assert offset['sentence'] == BEHIND.sentence
+    assert offset['sentence'] == LATE.sentence
     assert list(tree['solvers']) == ['exact', 'wls']
     assert [one['unit'] for one in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
     assert tree['solvers']['wls']['dy']['bias'] == 1.5e-6

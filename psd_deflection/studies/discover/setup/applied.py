@@ -20,8 +20,8 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
+from psd_deflection.studies.check.shared_findings import note_finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.free import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace

@@ -26,8 +26,8 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.judges import LOADS, unit_findings, wiring_findings
 from psd_deflection.studies.check.result import Finding
+from psd_deflection.studies.check.shared_findings import LOADS, unit_findings, wiring_findings
 from psd_deflection.studies.check.wirings import differences, line, wirings_of
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import Fit

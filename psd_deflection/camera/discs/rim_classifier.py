@@ -66,7 +66,7 @@ MOST_NOISE = 0.2
 """Largest rms of the residuals with an answer, in units of the contrast."""
 
 
-class Judge:
+class RimClassifier:
     """Judges the pictures of the discs of one target by one camera."""
 
     def __init__(self, lens: Lens, columns: int, centres: FloatArray) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from psd_deflection.records import BlockStatus, Record, SpotMeans
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.steps import last_step
+from psd_deflection.studies.loads.steps import last_load_change
 
 REACH_S = 60.0
 """A step that is older is not looked for."""
@@ -42,7 +42,7 @@ class RecentDots:
         for index, _, values in rows:
             if first <= index <= last:
                 dots[index - first] = values
-        found = last_step(self._rig, dots, self._period)
+        found = last_load_change(self._rig, dots, self._period)
         # Times are those of the middles of blocks; a step lies between two.
         ago_s = None if found is None else (last - first + 0.5) * self._period - found
         return None if ago_s is None else last_ns - round(ago_s * 1e9)
