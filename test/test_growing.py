@@ -100,7 +100,7 @@ BOUNDED_BY = {
     'run/reading/arrivals.py:t': 'one block',
     'run/recorder.py:_writing': 'MOST_THREADS',
     'run/recorder.py:queue': 'QUEUE_BYTES',
-    'run/repeats.py:reasons': 'MOST_REASONS',
+    'run/rate_limited_log.py:reasons': 'MOST_REASONS',
     'run/rig_publisher.py:_environment': 'our own names',
     'run/watcher.py:_segments': 'watch_memory and watch_minutes',
     'run/watcher.py:items': 'watch_memory',
