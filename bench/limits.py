@@ -88,9 +88,9 @@ def frames(times: int) -> list[Row]:
     def peer(received: list[bytes]) -> int:
         rest, found = b'', 0
         for piece in received:
-            *whole, rest = (rest + piece).split(b'\0')
+            *full, rest = (rest + piece).split(b'\0')
             decoded = []
-            for frame in whole:
+            for frame in full:
                 payload = cobs.decode(frame)
                 if zlib.crc32(payload[:-4]) == crc.unpack(payload[-4:])[0]:
                     decoded.append(layout.unpack(payload[:-4]))

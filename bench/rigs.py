@@ -137,10 +137,10 @@ def main() -> int:
     curve = Row('CPU of one rig of several in one process', '% of a core')
     while count <= args.most:
         found = measure(count, args.seconds)
-        whole = found['lost'] == 0 and found['samples'] > 990.0 * count
+        complete = found['lost'] == 0 and found['samples'] > 990.0 * count
         share = np.array([100 * found['share'] / count])
-        curve.figures.append(figure(f'{count} rigs, {"nothing" if whole else "samples"} lost', 'ours', share))
-        if not whole:
+        curve.figures.append(figure(f'{count} rigs, {"nothing" if complete else "samples"} lost', 'ours', share))
+        if not complete:
             break
         most, count = count, 2 * count
     name = f'{most} tried without a loss' if count > args.most else f'{count} lose samples'

@@ -130,13 +130,13 @@ class Arm(Plant):
         step = np.eye(4) + h * rates + 0.5 * h * h * rates @ rates
         early, late_half = 0.5 * h * h * rates @ push[:, None], h * push[:, None]
         # Without friction the substeps of a sample are one linear map.
-        whole = np.linalg.matrix_power(step, SUBSTEPS)
+        full = np.linalg.matrix_power(step, SUBSTEPS)
         held = sum(np.linalg.matrix_power(step, k) for k in range(SUBSTEPS)) @ (early + late_half)
         for i in range(n):
             out[:, 0, i] = x[0]
             out[:, 1, i] = x[1] * read + zero
             if friction == 0.0:
-                x = whole @ x + held * torque[:, i]
+                x = full @ x + held * torque[:, i]
                 continue
             for _ in range(SUBSTEPS):
                 force = torque[:, i] - friction * np.tanh(x[2] / CREEP_RATE)

@@ -78,7 +78,7 @@ def read(path: Path) -> dict[str, FloatArray]:
     return out
 
 
-def _whole(times: FloatArray) -> int:
+def _periods(times: FloatArray) -> int:
     """Heights until the steps of time become uneven."""
     steps = np.diff(times)
     uneven = np.flatnonzero(np.abs(steps - np.median(steps)) > UNEVEN)
@@ -105,7 +105,7 @@ class Balls(Plant):
         self.start = list[tuple[float, float]]()
         for name in BALLS:
             _, t, h = tables[name][tables[name][:, 0] == drop].T
-            count = _whole(t)
+            count = _periods(t)
             near = slice(BEGIN - AROUND, BEGIN + AROUND + 1)
             _, speed, height = np.polyfit(t[near] - t[BEGIN], h[near], 2).tolist()
             self.start.append((height, speed))

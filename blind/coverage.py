@@ -415,17 +415,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     cost: Array | None = None
     motion(100, 16)
     pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
-    whole = args.rows is None
-    pairs += [(row, 'none') for row in SLOW] if whole else []
+    full = args.rows is None
+    pairs += [(row, 'none') for row in SLOW] if full else []
     with ProcessPoolExecutor(args.jobs) as pool:
-        rough = {reported: pool.submit(coarse, reported=reported) for reported in (True, False)} if whole else {}
+        rough = {reported: pool.submit(coarse, reported=reported) for reported in (True, False)} if full else {}
         for row, loss, s in pool.map(_job, pairs):
             name = row.label if loss == 'none' else ''
             tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
             print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
             if cost is None:
                 cost = np.array(s.rest.rms) / bound(row)
-        if whole:
+        if full:
             warm = {reported: pool.submit(warming, reported) for reported in (True, False)}
             base = pool.submit(on_a_moving_base).result()
             print(f'| white, moving base | none | | | | | {_cells(base)} | {base.three:.4f} | |')
@@ -438,7 +438,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             r = found.result()
             label = '10 bit, no dither' if reported else '10 bit, the rig file says 16'
             print(f'| {label} | none | {_cells(r)} | | | | | {r.three:.4f} | |')
-    if cost is not None and whole:
+    if cost is not None and full:
         print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
         print(f'- white, no loss: {_three(cost)}')
         for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols')).items():

@@ -76,8 +76,8 @@ class Device:
                 message = now
             with contextlib.suppress(OSError):
                 asked += os.read(self._master, 4096)
-            *whole, asked = asked.split(b'\0')
-            out += [self._answer(f, now) for f in whole]
+            *lines, asked = asked.split(b'\0')
+            out += [self._answer(f, now) for f in lines]
             due = min(round(now * RATE), len(self._counts))
             for i in range(sent, due):
                 row = struct.pack('<BIQ6h', 0, i, round(i * 1e6 / RATE), *self._counts[i].tolist())

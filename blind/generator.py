@@ -235,14 +235,14 @@ def _clip_spot(x: Array, radius: float, profile: int) -> tuple[Array, Array]:
     angle = np.linspace(0.0, np.pi, 100_001)
     u, weight = -np.cos(angle), np.sin(angle) ** 2
     step = angle[1]
-    whole = np.concatenate(([0.0], np.cumsum(0.5 * step * (weight[1:] + weight[:-1]))))
+    full = np.concatenate(([0.0], np.cumsum(0.5 * step * (weight[1:] + weight[:-1]))))
     turn = weight * u
     first = np.concatenate(([0.0], np.cumsum(0.5 * step * (turn[1:] + turn[:-1]))))
     hi = np.arccos(-np.clip((half - x) / radius, -1.0, 1.0))
     lo = np.arccos(-np.clip((-half - x) / radius, -1.0, 1.0))
-    light = np.interp(hi, angle, whole) - np.interp(lo, angle, whole)
+    light = np.interp(hi, angle, full) - np.interp(lo, angle, full)
     moment = np.interp(hi, angle, first) - np.interp(lo, angle, first)
-    return x + radius * moment / light, light / whole[-1]
+    return x + radius * moment / light, light / full[-1]
 
 
 def sensors(dots: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> tuple[Array, Array]:

@@ -149,11 +149,11 @@ def test_a_golden_recording_is_true_at_the_middle_of_its_blocks(name: str) -> No
     assert 4000 - sum(s.present for s in spots.values()) == LOSES[name]
     expected = truth(name)
     # A load that is switched inside a block has no value at its middle: the block and the next are left out.
-    whole = [i for i in best if spots[i].present == 20 and i % 50 > 1]
-    assert len(whole) > 120
-    error = np.array([best[i][3:6] for i in whole]) - expected[whole]
-    sd = np.sqrt([np.array(best[i].covariance)[[0, 4, 8]] for i in whole])
+    full = [i for i in best if spots[i].present == 20 and i % 50 > 1]
+    assert len(full) > 120
+    error = np.array([best[i][3:6] for i in full]) - expected[full]
+    sd = np.sqrt([np.array(best[i].covariance)[[0, 4, 8]] for i in full])
     # The mean of the truth over a block is not its value in the middle while the link rings: some per cent of it.
-    still = [k for k, i in enumerate(whole) if i < 50]
+    still = [k for k, i in enumerate(full) if i < 50]
     ratio = np.sqrt((error[still] ** 2).mean(axis=0) / (sd[still] ** 2).mean(axis=0))
     assert (ratio < 1.3).all()

@@ -131,8 +131,8 @@ def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
         _, _, sums = written.rows(f'sums/psd_{n}', 'Scalars:scalars')
         need(np.allclose(sums, light, rtol=1e-6), f'sum{n} differs')
     _, _, lost = written.rows('lost', 'Scalars:scalars')
-    whole = recording.block_size
-    need(int(lost[lost < whole].sum()) == int((whole - present).sum()), 'the count of lost samples differs')
+    full = recording.block_size
+    need(int(lost[lost < full].sum()) == int((full - present).sum()), 'the count of lost samples differs')
 
 
 def picture(files: list[Path], target: Path) -> bool:

@@ -186,8 +186,8 @@ def _lines(kind: str, text: str) -> Iterator[str]:
     lines = [raw.rstrip() for raw in text.replace('\\\n', ' ').splitlines() if raw.strip()]
     if kind in ('', 'console'):
         prompted = [raw[2:] for raw in lines if raw.startswith('$ ')]
-        whole = lines if lines and lines[0].split()[0] in PROGRAMS else []
-        lines = prompted or whole
+        full = lines if lines and lines[0].split()[0] in PROGRAMS else []
+        lines = prompted or full
     for raw in lines:
         line = re.split(r'\s+#\s|^#', raw + ' ')[0].strip()
         if line:
@@ -430,9 +430,9 @@ def copy_checkout(target: Path) -> None:
         if name and (ROOT / name).is_file():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target / name)
-    whole = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
+    full = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
     (target / CUT).mkdir(parents=True)
-    (target / CUT / 'cut_0.mcap').write_bytes(whole[: len(whole) * 6 // 10])
+    (target / CUT / 'cut_0.mcap').write_bytes(full[: len(full) * 6 // 10])
 
 
 def main() -> int:

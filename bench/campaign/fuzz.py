@@ -79,15 +79,15 @@ def frames_target() -> tuple[Target, list[bytes]]:
         stream = stream[:4096]
         # The first byte chooses of how many PSDs a sample is.
         psds = 2 + (stream[0] if stream else 0) % (MOST_PSDS - 1)
-        whole = FrameDecoder(psds).feed(b'\x00' + stream)
+        full = FrameDecoder(psds).feed(b'\x00' + stream)
         pieces = FrameDecoder(psds)
         apart = pieces.feed(b'\x00')
         for i in range(len(stream)):
             apart += pieces.feed(stream[i : i + 1])
         # By text: NaN in a HELLO is not equal to itself.
-        if repr(whole) != repr(apart):
-            raise AssertionError(f'{apart} byte by byte, but {whole} whole')
-        return [f.reason for f in whole if isinstance(f, BadFrame)]
+        if repr(full) != repr(apart):
+            raise AssertionError(f'{apart} byte by byte, but {full} whole')
+        return [f.reason for f in full if isinstance(f, BadFrame)]
 
     seeds = [
         *(bytes((n - 2,)) + encode(SampleFrame(0, 1, 1000, tuple(range(3 * n)))) for n in range(2, MOST_PSDS + 1)),

@@ -56,7 +56,7 @@ MAGIC = (
     b'P5 99999 99999 255\n',
 )
 _SEQUENCE = re.compile(r'(?:sequence<(?P<of>.+?)(?:, \d+)?>|(?P<array>.+)\[(?P<count>\d+)\])$')
-_WHOLE = re.compile(r'(?P<sign>u?)int(?P<bits>\d+)$|(?P<byte>octet|byte|char)$')
+_INTEGER = re.compile(r'(?P<sign>u?)int(?P<bits>\d+)$|(?P<byte>octet|byte|char)$')
 
 
 class Stranger:
@@ -138,16 +138,16 @@ class Stranger:
             return self.chance.random() < 0.5
         if kind.startswith(('string', 'wstring')):
             return self.text(value)
-        whole = _WHOLE.match(kind)
-        if whole is None:
+        match = _INTEGER.match(kind)
+        if match is None:
             raise TypeError(f'{kind}: no field of this type can be made strange yet')
-        bits = 8 if whole['byte'] else int(whole['bits'])
+        bits = 8 if match['byte'] else int(match['bits'])
         low, high = (
-            (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if whole['sign'] == '' and not whole['byte'] else (0, 2**bits - 1)
+            (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if match['sign'] == '' and not match['byte'] else (0, 2**bits - 1)
         )
         out = self.chance.choice((low, high, 0, 1, value + 1, value - 1, self.chance.randint(low, high)))
         clipped = max(low, min(high, out))
-        return bytes([clipped]) if whole['byte'] and isinstance(value, bytes) else clipped
+        return bytes([clipped]) if match['byte'] and isinstance(value, bytes) else clipped
 
     def text(self, usual: str) -> str:
         """Another one, which is mostly short."""

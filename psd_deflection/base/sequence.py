@@ -100,7 +100,7 @@ class RecordedSequence:
 
     A number that goes back is a wrap if that many samples fit into the elapsed time; any other one is a restart, and
     no block mixes the two runs. ``warn`` is called with a sentence, ``note_restart`` with the extended numbers before
-    and after. Numbers that were recorded ``whole`` do not wrap.
+    and after. Numbers that were recorded ``full`` do not wrap.
     """
 
     _FASTEST_HZ = 20_000
@@ -114,40 +114,40 @@ class RecordedSequence:
         self._last: int | None = None
         self._last_t = -1
 
-    def follows(self, seq: IntArray, t_ns: IntArray, whole: bool) -> bool:
+    def follows(self, seq: IntArray, t_ns: IntArray, full: bool) -> bool:
         """Whether these samples continue the last ones without a number or time going back."""
         return (
-            (self._last is None or int(seq[0]) + self._base(whole) > self._last)
+            (self._last is None or int(seq[0]) + self._base(full) > self._last)
             and int(t_ns[0]) > self._last_t
             and bool((np.diff(seq) > 0).all())
             and bool((np.diff(t_ns) > 0).all())
         )
 
-    def _base(self, whole: bool) -> int:
-        return self._moved if whole else self._moved + self._wrapped
+    def _base(self, full: bool) -> int:
+        return self._moved if full else self._moved + self._wrapped
 
-    def extended(self, seq: IntArray, t_ns: IntArray, whole: bool) -> IntArray:
+    def extended(self, seq: IntArray, t_ns: IntArray, full: bool) -> IntArray:
         """Numbers that increase from call to call. Raises ValueError if they do not increase within one call."""
         seq = seq.copy()
-        if not whole:
+        if not full:
             seq[seq < seq[0]] += WRAP
         if bool((np.diff(seq) <= 0).any()):
             raise ValueError('seq does not rise within the message')
         if bool((np.diff(t_ns) <= 0).any()):
             raise ValueError('dt does not rise within the message')
-        first = int(seq[0]) + self._base(whole)
+        first = int(seq[0]) + self._base(full)
         if self._last is not None and first <= self._last:
-            self._go_on(self._last, first, int(t_ns[0]), whole)
+            self._go_on(self._last, first, int(t_ns[0]), full)
         if t_ns[0] <= self._last_t:
             self._warn(f'time goes back to {t_ns[0]} ns')
-        seq += self._base(whole)
+        seq += self._base(full)
         self._last, self._last_t = int(seq[-1]), int(t_ns[-1])
         return seq
 
-    def _go_on(self, last: int, first: int, t_ns: int, whole: bool) -> None:
+    def _go_on(self, last: int, first: int, t_ns: int, full: bool) -> None:
         """Continue counting after ``last`` at ``first``, which is not greater."""
         step = (first - last) % WRAP
-        if not whole and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
+        if not full and 0 < step <= 1000 + (t_ns - self._last_t) * self._FASTEST_HZ // 1_000_000_000:
             self._wrapped += last + step - first
             return
         self._warn(f'sample numbers start again after {last}')

@@ -121,8 +121,8 @@ def write_rows(
     out: ParquetFile, names: Sequence[str], rows: Mapping[str, Mapping[str, object]], failed: Mapping[str, str]
 ) -> None:
     """One row a recording: its cells, or the error alone. Ends the file."""
-    whole = [rows.get(name, {}) for name in names]
-    cells: dict[str, list[object]] = {f.name: [row.get(f.name) for row in whole] for f in out.fields}
+    rows_of_all = [rows.get(name, {}) for name in names]
+    cells: dict[str, list[object]] = {f.name: [row.get(f.name) for row in rows_of_all] for f in out.fields}
     cells[ERROR.name] = [failed.get(name, '') for name in names]
     out.put(names, cells)
     out.close(failed)

@@ -15,7 +15,7 @@ from typing import Any
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._options import in_the_world, reject, world_option
-from psd_deflection.cli._values import given_as_option, whole
+from psd_deflection.cli._values import given_as_option, integer
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.recordings.replay.simulated_run import SimulatedRun
 from psd_deflection.recordings.write.sinks import open_sink
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         '--at-most',
-        type=whole('--at-most', 1, 20),
+        type=integer('--at-most', 1, 20),
         default=3,
         metavar='N',
         help='recordings that --run makes (default 3)',

@@ -19,7 +19,7 @@ from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.recordings.formats.registry import formats
-from psd_deflection.recordings.spans import MARK_WORD, WHOLE, Bound
+from psd_deflection.recordings.spans import FULL, MARK_WORD, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file
@@ -151,7 +151,7 @@ def namespace_option(parser: argparse._ActionsContainer) -> None:
 
 def span_options(parser: argparse._ActionsContainer) -> None:
     """Add --from and --to, for a part of a recording: ``args.span``."""
-    parser.set_defaults(span=WHOLE)
+    parser.set_defaults(span=FULL)
     for at, (option, words) in enumerate((('--from', 'from'), ('--to', 'up to'))):
         parser.add_argument(
             option,

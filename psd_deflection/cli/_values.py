@@ -19,10 +19,10 @@ N = TypeVar('N', int, float)
 
 def seed(text: str) -> int:
     """A value of --seed; raises UsageError."""
-    return whole('--seed', 0)(text)
+    return integer('--seed', 0)(text)
 
 
-def whole(option: str, least: int, most: int | None = None) -> Callable[[str], int]:
+def integer(option: str, least: int, most: int | None = None) -> Callable[[str], int]:
     """Reads a whole number within bounds; what it gives raises UsageError."""
     bounds = f'at least {least}' + ('' if most is None else f' and at most {most}')
     return functools.partial(

@@ -29,7 +29,7 @@ from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealt
 from psd_deflection.measure.measures import BlockMeasures, measured, of_one_length
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
-from psd_deflection.measure.state import STATE, WHOLE, Part, State, Value, load_states, numbers
+from psd_deflection.measure.state import FULL, STATE, Part, State, Value, load_states, numbers
 from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.rest import why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
@@ -231,7 +231,7 @@ class Pipeline:
             reported.pop(name, None)
         load = {name: reported.pop(name) for name in (KNOWN_LOAD,) if name in reported}
         memory = {name: reported.pop(name) for name in tuple(reported) if name in ENVIRONMENT or name.startswith(STATE)}
-        if memory.pop(WHOLE, None) is not None:
+        if memory.pop(FULL, None) is not None:
             self._begin(self.rig)
         if reported:
             self._change_rig(reported)

@@ -18,7 +18,7 @@ State = dict[str, Value]
 :data:`STATE`."""
 
 STATE = 'state.'
-WHOLE = 'state.whole'
+FULL = 'state.whole'
 """In a change that is the complete state of a pipeline: another one forgets its own first."""
 
 

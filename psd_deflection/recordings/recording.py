@@ -480,11 +480,11 @@ class RecordingWindow(Recording):
         if not count:
             return count, last
         until = min(last, self.end_ns - 1)
-        whole = part = 0
+        full = part = 0
         for block in self._source.blocks():
-            whole += int(np.count_nonzero(block.t_ns <= last))
+            full += int(np.count_nonzero(block.t_ns <= last))
             part += int(np.count_nonzero((block.t_ns >= self.first_ns) & (block.t_ns <= until)))
-        return round(count * part / whole) if whole else 0, until
+        return round(count * part / full) if full else 0, until
 
     def marks(self) -> list[Mark]:
         """Those that were set in it."""

@@ -22,7 +22,7 @@ MARK_WORD = 'mark:'
 """Begins a bound that is a mark."""
 Span = tuple[Bound | None, Bound | None]
 """From and up to; None: the start or the end."""
-WHOLE: Span = (None, None)
+FULL: Span = (None, None)
 MOST_NAMED = 20
 """Marks that are named if the one that is wanted is not there."""
 LONGEST_TEXT = 2000

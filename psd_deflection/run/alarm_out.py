@@ -218,5 +218,5 @@ def _post(address: str, text: bytes, ending: threading.Event) -> None:
 
 def _utc(t_ns: int) -> str:
     """Time in UTC as ISO 8601 has it, to ms."""
-    whole, rest = divmod(t_ns, 1_000_000_000)
-    return datetime.fromtimestamp(whole, UTC).strftime('%Y-%m-%dT%H:%M:%S') + f'.{rest // 1_000_000:03d}Z'
+    s, rest = divmod(t_ns, 1_000_000_000)
+    return datetime.fromtimestamp(s, UTC).strftime('%Y-%m-%dT%H:%M:%S') + f'.{rest // 1_000_000:03d}Z'

@@ -30,7 +30,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import rig_at_end, warnings_about_rig
-from psd_deflection.recordings.spans import WHOLE, Span
+from psd_deflection.recordings.spans import FULL, Span
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import nested, parameter_text
@@ -188,7 +188,7 @@ def opened(
     rig: Rig | str | Path | None = None,
     *,
     namespace: str | None = None,
-    span: Span = WHOLE,
+    span: Span = FULL,
     notify: Notify = warn_caller,
 ) -> Opened:
     """Return the recording and the rig that describes it: ``rig``, its parameter file, or that of the recording's end.

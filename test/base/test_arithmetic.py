@@ -226,8 +226,8 @@ def test_products_with_what_is_later_are_whole_numbers_that_no_order_of_the_sum_
     units = np.array(
         [2.0 ** (np.frexp(np.abs(column).max())[1] - (52 - length.bit_length()) // 2) for column in series.T]
     )
-    whole = np.rint(series[:, :2] / units[:2]).astype(int)
-    exact = sum(int(a) * int(b) for a, b in zip(whole[:-1, 0].tolist(), whole[1:, 1].tolist(), strict=True))
+    full = np.rint(series[:, :2] / units[:2]).astype(int)
+    exact = sum(int(a) * int(b) for a, b in zip(full[:-1, 0].tolist(), full[1:, 1].tolist(), strict=True))
     assert got[0, 1, 1] == exact * units[0] * units[1]
 
 

@@ -142,12 +142,12 @@ def test_a_key_switches_its_curve_in_every_plot(page: Page) -> None:
 
 
 def test_a_drag_looks_closer_in_all_plots_of_one_axis_and_a_button_goes_back(page: Page) -> None:
-    whole = 'document.querySelector("button.whole").checkVisibility()'
-    assert not page.js(whole)
+    full = 'document.querySelector("button.whole").checkVisibility()'
+    assert not page.js(full)
     over = page.driver.find_element(By.CSS_SELECTOR, '#plot_c0p1 .u-over')
     move(page, 'c0p1', 0.2)
     ActionChains(page.driver).click_and_hold().move_by_offset(round(0.1 * over.size['width']), 0).release().perform()
-    page.until(whole)
+    page.until(full)
     found = []
     for across in (0.01, 0.99):
         move(page, 'c0p0', across)
@@ -156,7 +156,7 @@ def test_a_drag_looks_closer_in_all_plots_of_one_axis_and_a_button_goes_back(pag
     assert found[0] >= 19
     assert found[1] <= 31
     page.driver.find_element(By.CSS_SELECTOR, 'button.whole').click()
-    page.until(f'!{whole}')
+    page.until(f'!{full}')
     move(page, 'c0p0', 0.98)
     page.until('parseFloat(document.querySelector("output.at[data-plot=c0p0]").textContent) > 90')
 

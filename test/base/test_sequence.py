@@ -124,8 +124,8 @@ class Recorded:
         )
         assert self.extended(seq, ms) == seq
 
-    def extended(self, seq: list[int], ms: list[float], whole: bool = False) -> list[int]:
-        return [int(n) for n in self._sequence.extended(np.array(seq), self._ns(ms), whole)]
+    def extended(self, seq: list[int], ms: list[float], full: bool = False) -> list[int]:
+        return [int(n) for n in self._sequence.extended(np.array(seq), self._ns(ms), full)]
 
     def follows(self, seq: list[int], ms: list[float]) -> bool:
         return self._sequence.follows(np.array(seq), self._ns(ms), False)
@@ -196,7 +196,7 @@ def test_the_number_after_the_last_of_32_bits_is_0_and_goes_on() -> None:
 def test_whole_numbers_that_go_back_within_a_message_are_rejected() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     with pytest.raises(ValueError, match='seq does not rise'):
-        of.extended([9, 8], [8.0, 9.0], whole=True)
+        of.extended([9, 8], [8.0, 9.0], full=True)
     with pytest.raises(ValueError, match='seq does not rise'):
         of.extended([9, 8, 10], [8.0, 9.0, 10.0])
 
@@ -206,5 +206,5 @@ def test_a_wrap_within_a_message_and_numbers_that_were_recorded_whole() -> None:
         *range(WRAP - 2, WRAP + 2)
     ]
     of = Recorded([WRAP - 1], [0.0])
-    assert of.extended([5, 6], [1.0, 2.0], whole=True) == [WRAP // 20 * 20 + 20 + 5, WRAP // 20 * 20 + 20 + 6]
+    assert of.extended([5, 6], [1.0, 2.0], full=True) == [WRAP // 20 * 20 + 20 + 5, WRAP // 20 * 20 + 20 + 6]
     assert len(of.restarts) == 1

@@ -15,9 +15,9 @@ pytestmark = pytest.mark.slow
 
 def test_a_bound_of_all_pixels_is_that_of_a_mask_of_all_and_half_of_them_know_less() -> None:
     scene = Scene(width=320, height=240, focal=900.0, centre=(160.0, 120.0))
-    whole = np.ones((240, 320), dtype=bool)
-    upper = whole.copy()
+    full = np.ones((240, 320), dtype=bool)
+    upper = full.copy()
     upper[120:] = False
-    everything, masked, half = pose_bounds(scene, discs_picture, slice(None), whole, upper)
+    everything, masked, half = pose_bounds(scene, discs_picture, slice(None), full, upper)
     np.testing.assert_allclose(everything, masked)
     assert (half > everything).all()

@@ -195,8 +195,8 @@ def test_what_is_left_unreported_fails_the_suite() -> None:
     gap = {'before': 4.0, 'after': 2.0, 'floor': 1.0, 'heldout_after': 1.0}
     answer = {'verdict': 'effects_found', 'effects': [], 'unknown': [], 'setup': [], 'gap': gap}
     for floors, failures in ((1.4, 0), (1.6, 1)):
-        whole = {**answer, 'remaining': {'floors': floors}, 'provenance': {'forward_simulations': 1}}
-        text, _ = score.summary([score.Row('spread', 'spread', 3.0, True, [{'name': 'creep'}], whole)])
+        full = {**answer, 'remaining': {'floors': floors}, 'provenance': {'forward_simulations': 1}}
+        text, _ = score.summary([score.Row('spread', 'spread', 3.0, True, [{'name': 'creep'}], full)])
         assert f'answers that leave more than 1.5 floors unsaid: {failures}' in text
         assert 'all of a pair or triple of 1:10:100 floors: 0.0 % (0/1' in text
 

@@ -68,6 +68,6 @@ def test_what_an_answer_leaves_out_counts_as_nothing() -> None:
     assert score.complete({'effects': [{'name': 'a'}]})['verdict'] == 'effects_found'
     assert score.complete({'effects': [{'name': 'a'}], 'unknown': [{}]})['unknown'] == [{'law': None}]
     assert score.complete({'effects': [{'name': 'a'}], 'unknown': [{}]})['verdict'] == 'unknown_effect'
-    whole = {'verdict': 'unknown_effect', 'gap': {'floor': 1.0}, 'effects': [], 'unknown': []}
-    assert score.complete(whole)['gap'] == {'floor': 1.0}
-    assert score.complete(whole)['verdict'] == 'unknown_effect'
+    full = {'verdict': 'unknown_effect', 'gap': {'floor': 1.0}, 'effects': [], 'unknown': []}
+    assert score.complete(full)['gap'] == {'floor': 1.0}
+    assert score.complete(full)['verdict'] == 'unknown_effect'

@@ -48,8 +48,8 @@ def test_a_law_has_the_gap_it_says() -> None:
 
 
 def reported(**law: Any) -> dict[str, Any]:
-    whole = {'stage': 'psd', 'variables': ['x1'], 'kind': 'static', 'expression': '', 'heldout_after': 2.2e-7}
-    message = {**whole, 'equivalent': [], **law}
+    full = {'stage': 'psd', 'variables': ['x1'], 'kind': 'static', 'expression': '', 'heldout_after': 2.2e-7}
+    message = {**full, 'equivalent': [], **law}
     gap = {'floor': 2e-7, 'heldout_after': 1e-6}
     return {'verdict': 'unknown_effect', 'effects': [], 'setup': [], 'unknown': [{'law': message}], 'gap': gap}
 

@@ -38,9 +38,9 @@ def test_the_table_has_every_term_and_the_totals_add_up(
         for kind in ('per estimate', 'systematic', 'known bias')
     ]
     total = [float(v) for v in next(line for line in out.splitlines() if line.startswith('total')).split()[-3:]]
-    for column, whole in zip(zip(*parts, strict=True), total, strict=True):
+    for column, integer in zip(zip(*parts, strict=True), total, strict=True):
         # Root sum of squares, to the printed digits and the small biases that systematic terms have.
-        assert whole == pytest.approx(sum(v**2 for v in column) ** 0.5, rel=0.01)
+        assert integer == pytest.approx(sum(v**2 for v in column) ** 0.5, rel=0.01)
     assert 'Monte Carlo, 2000 draws' in out
     # Nothing is written unasked.
     assert list(tmp_path.iterdir()) == []

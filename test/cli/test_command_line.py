@@ -135,9 +135,9 @@ def test_recordings_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_a_bag_that_lost_its_tail_is_read_up_to_the_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = (BAGS / 'clean' / 'clean_0.mcap').read_bytes()
+    integer = (BAGS / 'clean' / 'clean_0.mcap').read_bytes()
     cut = tmp_path / 'cut_0.mcap'
-    cut.write_bytes(whole[: len(whole) * 6 // 10])
+    cut.write_bytes(integer[: len(integer) * 6 // 10])
     assert main(['replay', str(cut)]) == 0
     out, err = capsys.readouterr()
     assert 'warning' in err

@@ -90,9 +90,9 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
     # The clock's map settles in the first second, and the device was off for two seconds on the way.
     with BagWriter(tmp_path / 'run', rig_values={'block_size': 20}) as bag:
         for i in range(200):
-            whole = block(i, t0=T0 + (2_000_000_000 if i >= 100 else 0))
-            late = np.clip(1_000_000 - whole.seq * 1000, 0, None)
-            bag.put(SampleBlock(i, whole.seq, whole.t_ns - late, whole.volts, whole.flags))
+            integer = block(i, t0=T0 + (2_000_000_000 if i >= 100 else 0))
+            late = np.clip(1_000_000 - integer.seq * 1000, 0, None)
+            bag.put(SampleBlock(i, integer.seq, integer.t_ns - late, integer.volts, integer.flags))
     assert main(['info', str(tmp_path / 'run'), '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     assert open_recording(tmp_path / 'run').sample_rate_hz == pytest.approx(999.0, rel=1e-4)

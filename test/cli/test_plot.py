@@ -184,13 +184,13 @@ def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: 
     lost, _, gone, marks = drawn_of([*range(17, 62), 64])
     assert lost == [0.0, 0.0, 0.0, 2.0]
     assert (gone, marks) == (2, ['no estimate', 'lost samples'])
-    whole = tmp_path / 'whole.csv'
-    assert main(['convert', str(BAGS / 'clean'), '--out', str(whole)]) == 0
-    whole.write_text('\n'.join([*whole.read_text().splitlines()[:66], '']))
+    integer = tmp_path / 'whole.csv'
+    assert main(['convert', str(BAGS / 'clean'), '--out', str(integer)]) == 0
+    integer.write_text('\n'.join([*integer.read_text().splitlines()[:66], '']))
     capsys.readouterr()
-    assert main(['plot', str(whole), '--out', str(tmp_path / 'a.svg')]) == 0
+    assert main(['plot', str(integer), '--out', str(tmp_path / 'a.svg')]) == 0
     assert re.search(r'too few samples +1 block$', capsys.readouterr().out, re.MULTILINE)
-    assert main(['replay', str(whole)]) == 0
+    assert main(['replay', str(integer)]) == 0
     assert 'no estimate: 1 block, too few samples' in capsys.readouterr().out
 
 

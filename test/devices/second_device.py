@@ -106,10 +106,10 @@ class Emulator:
 
     def receive(self, received: bytes, now_us: int) -> bytes:
         """Answers to the host."""
-        *whole, self.heard = (self.heard + received).split(b'\x00')
+        *full, self.heard = (self.heard + received).split(b'\x00')
         self.heard = self.heard[-512:]
         answers = b''
-        for encoded in whole:
+        for encoded in full:
             message = unframe(encoded)
             if message is None:
                 continue

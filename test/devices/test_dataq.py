@@ -108,8 +108,8 @@ def test_bytes_between_scans_cost_no_scan(more: int, cuts: list[int]) -> None:
         got = fed(SCAN * 5 + b'\x11' * more + SCAN * following, cuts)
         assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * (5 + following)
         # By a scan's length at a time, and then what is left.
-        whole = (more - 1) // 14
-        assert [g.size for g in got if isinstance(g, BadFrame)] == [14] * whole + [more - 14 * whole]
+        full = (more - 1) // 14
+        assert [g.size for g in got if isinstance(g, BadFrame)] == [14] * full + [more - 14 * full]
 
 
 def test_two_readings_at_the_rail_are_no_marker() -> None:

@@ -79,8 +79,8 @@ def test_a_sample_each_millisecond_of_its_clock_and_hello_and_status_once_a_seco
 
 
 def test_it_sends_the_same_however_often_it_is_asked() -> None:
-    whole, parts = device(seed=3), device(seed=3)
-    expected = whole.take(500 * MS, room=1 << 30)
+    full, parts = device(seed=3), device(seed=3)
+    expected = full.take(500 * MS, room=1 << 30)
     assert b''.join(parts.take(t * MS, room=1 << 30) for t in range(501)) == expected
 
 

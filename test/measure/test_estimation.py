@@ -87,8 +87,8 @@ def test_fewer_samples_make_the_mean_less_sure() -> None:
     pipeline = Pipeline(load_rig())
     list(pipeline.process(chunk(at_rest(1)[:12])))
     (few,) = (r for r in pipeline.flush() if isinstance(r, DeflectionEstimate) and r.primary)
-    (whole,) = estimates(at_rest(1), {})
-    np.testing.assert_allclose(few.covariance, 20.0 / 12.0 * np.array(whole.covariance), rtol=1e-8, atol=1e-24)
+    (full,) = estimates(at_rest(1), {})
+    np.testing.assert_allclose(few.covariance, 20.0 / 12.0 * np.array(full.covariance), rtol=1e-8, atol=1e-24)
 
 
 def test_half_the_light_doubles_the_noise_of_the_readings() -> None:

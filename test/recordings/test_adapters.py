@@ -321,10 +321,10 @@ def test_seq_is_recorded_modulo_2_to_the_32_with_what_is_above_beside_it() -> No
 
 
 def test_a_block_with_a_long_pause_takes_two_messages() -> None:
-    whole = block(0)
-    t_ns = whole.t_ns.copy()
+    full = block(0)
+    t_ns = full.t_ns.copy()
     t_ns[12:] += 10 * 10**9
-    paused = SampleBlock(0, whole.seq, t_ns, whole.volts, whole.flags)
+    paused = SampleBlock(0, full.seq, t_ns, full.volts, full.flags)
     first, second = to_messages(paused)
     assert (first.fields['width'], second.fields['width']) == (12, 8)
     t, points = point_cloud2.to_points(second.fields)
@@ -333,10 +333,10 @@ def test_a_block_with_a_long_pause_takes_two_messages() -> None:
 
 @pytest.mark.parametrize(('span', 'pieces'), [(2**32 - 1, 1), (2**32, 2)])
 def test_a_block_is_cut_only_if_its_times_do_not_fit(span: int, pieces: int) -> None:
-    whole = block(0)
-    t_ns = whole.t_ns.copy()
+    full = block(0)
+    t_ns = full.t_ns.copy()
     t_ns[-1] = t_ns[0] + span
-    given_block = SampleBlock(0, whole.seq, t_ns, whole.volts, whole.flags)
+    given_block = SampleBlock(0, full.seq, t_ns, full.volts, full.flags)
     messages = to_messages(given_block)
     assert len(messages) == pieces
     assert (next(point_cloud2.parts(given_block)) is given_block) == (pieces == 1)
@@ -564,11 +564,11 @@ def test_bytes_are_a_message_or_rejected(junk: bytes, name: str) -> None:
 )
 def test_a_message_that_is_cut_is_rejected(name: str, data: st.DataObject) -> None:
     record = next(m for r in run(60) for m in to_messages(r) if m.type == name)
-    whole = cdr.encode(name, record.fields)
-    assert cdr.decode(name, whole) == record.fields
-    size = data.draw(st.integers(0, len(whole) - 1))
+    full = cdr.encode(name, record.fields)
+    assert cdr.decode(name, full) == record.fields
+    size = data.draw(st.integers(0, len(full) - 1))
     with pytest.raises(ValueError, match=f'not a {name}'):
-        cdr.decode(name, whole[:size])
+        cdr.decode(name, full[:size])
 
 
 def test_an_independent_decoder_reads_the_rig() -> None:

@@ -162,14 +162,14 @@ def test_channels_are_left_out_beyond_what_a_file_can_need(tmp_path: Path) -> No
 @pytest.mark.parametrize('tail', [1_000, 2 * 10**9])
 def test_a_tail_of_zeros_is_a_cut(tmp_path: Path, tail: int, monkeypatch: pytest.MonkeyPatch) -> None:
     records = list(run(60))
-    whole = write_mcap(tmp_path / 'a.mcap', records).read_bytes()
+    full = write_mcap(tmp_path / 'a.mcap', records).read_bytes()
     path = tmp_path / 'zeros.mcap'
-    path.write_bytes(whole[: len(whole) * 2 // 3])
+    path.write_bytes(full[: len(full) * 2 // 3])
     cut = BagRecording(path)
     before = [b.index for b in cut.blocks()]
     ends = next(s.cut_at for s in cut._sources)
     assert ends is not None
-    path.write_bytes(whole[:ends])
+    path.write_bytes(full[:ends])
     os.truncate(path, ends + tail)
     with counted(monkeypatch) as work:
         recording = BagRecording(path)

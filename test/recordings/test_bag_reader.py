@@ -256,10 +256,10 @@ def test_a_restart_that_makes_no_sense_is_none(tmp_path: Path, value: str) -> No
 
 
 def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
-    whole = block(1)
-    t_ns = whole.t_ns.copy()
+    full = block(1)
+    t_ns = full.t_ns.copy()
     t_ns[12:] += 10 * 10**9
-    paused = SampleBlock(1, whole.seq, t_ns, whole.volts, whole.flags)
+    paused = SampleBlock(1, full.seq, t_ns, full.volts, full.flags)
     later = block(2, t0=T0 + 10 * 10**9)
     assert_same(
         list(open_recording(write_mcap(tmp_path / 'a.mcap', [block(0), paused, later])).blocks()),

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
-WHOLE = {'int32': (-(2**31), 2**31 - 1), 'uint32': (0, 2**32 - 1), 'uint8': (0, 255), 'byte': (0, 255)}
+FULL = {'int32': (-(2**31), 2**31 - 1), 'uint32': (0, 2**32 - 1), 'uint8': (0, 255), 'byte': (0, 255)}
 
 
 def values(message: MessageType, kind: str = '') -> st.SearchStrategy[Any]:
@@ -32,8 +32,8 @@ def values(message: MessageType, kind: str = '') -> st.SearchStrategy[Any]:
             return st.binary(max_size=40)
         size = int(array[2]) if array[2] else None
         return st.lists(values(message, array[1]), min_size=size or 0, max_size=size or 3)
-    if kind in WHOLE:
-        return st.integers(*WHOLE[kind])
+    if kind in FULL:
+        return st.integers(*FULL[kind])
     if kind == 'float64':
         return st.floats(allow_nan=False)
     if kind == 'string':

@@ -44,13 +44,13 @@ def test_texts_and_whole_numbers_must_be_the_same() -> None:
 
 
 def test_a_covariance_agrees_by_the_deviations_of_row_and_column() -> None:
-    whole = np.diag([1e-14, 4e-14, 1e6]).ravel()
+    full = np.diag([1e-14, 4e-14, 1e6]).ravel()
     for i, j, off in ((0, 0, 1e-23), (0, 1, 2e-23), (1, 2, 2e-13)):
         for share, same in ((0.9, True), (1.1, False)):
-            other = whole.copy()
+            other = full.copy()
             other[3 * i + j] += share * off
-            assert agree({'covariance': whole}, {'covariance': other}, 1.0) is same
-    assert not agree({'covariance': whole}, {'covariance': whole[:4]}, 1.0)
+            assert agree({'covariance': full}, {'covariance': other}, 1.0) is same
+    assert not agree({'covariance': full}, {'covariance': full[:4]}, 1.0)
 
 
 def test_what_is_no_number_agrees_with_itself() -> None:

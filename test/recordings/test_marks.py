@@ -37,10 +37,10 @@ def marked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_marks_are_read_and_belong_to_their_part(marked: Path) -> None:
-    whole = psd_deflection.open(marked)
-    assert whole.marks() == MARKS
-    assert whole.crop(0.6, 1.2).marks() == MARKS[1:2]
-    assert whole.topics()[MARK] == 3
+    full = psd_deflection.open(marked)
+    assert full.marks() == MARKS
+    assert full.crop(0.6, 1.2).marks() == MARKS[1:2]
+    assert full.topics()[MARK] == 3
 
 
 @pytest.mark.parametrize(
@@ -62,13 +62,13 @@ def test_a_mark_is_a_bound(
 
 
 def test_a_mark_that_is_not_there_is_named_with_those_that_are(marked: Path) -> None:
-    whole = psd_deflection.open(marked)
+    full = psd_deflection.open(marked)
     with pytest.raises(
         RecordingError, match="marked: has no mark 'bumb'; its marks are at rest, bump; did you mean bump"
     ):
-        whole.crop('mark:bumb')
+        full.crop('mark:bumb')
     with pytest.raises(ConfigError, match="'bump': must be s from the first sample"):
-        whole.crop('bump')
+        full.crop('bump')
     with pytest.raises(RecordingError, match='it has no marks'):
         psd_deflection.simulate().crop('mark:x')
 

@@ -49,16 +49,16 @@ def test_a_slice_is_a_part() -> None:
     assert inside.t.tolist() == [t for t in estimates.t.tolist() if 1.0 <= t < 2.0]
     assert inside[:1.5].t.tolist() == [t for t in inside.t.tolist() if t < 1.5]
     assert len(estimates[9.0:]) == 0
-    for whole in (recording, estimates):
+    for full in (recording, estimates):
         for wrong in (3, slice(1.0, 2.0, 0.5)):
             with pytest.raises(ConfigError, match=r'must be a part of time, as (recording|estimates)\['):
-                whole[wrong]  # type: ignore[index]
+                full[wrong]  # type: ignore[index]
 
 
 def test_samples_keep_number_time_and_volts() -> None:
-    whole = staircase()
-    part = whole.crop(1.505, 2.5)
-    inside = whole.samples[1505:2500]
+    full = staircase()
+    part = full.crop(1.505, 2.5)
+    inside = full.samples[1505:2500]
     for name in ('seq', 't_ns', 'x1', 'sum2', 'flags'):
         np.testing.assert_array_equal(part.samples[name], inside[name])
     assert part.samples['t'][0] == 0.0
@@ -83,20 +83,20 @@ def test_what_held_at_the_start_holds_from_there_on() -> None:
 
 
 def test_parts_put_together_are_the_whole() -> None:
-    whole = psd_deflection.open(BAGS / 'clean')
+    full = psd_deflection.open(BAGS / 'clean')
     times = [None, 0.5, 1.5015, 3.0, None]
-    parts = [whole.crop(a, b) for a, b in itertools.pairwise(times)]
-    np.testing.assert_array_equal(np.concatenate([part.samples['x1'] for part in parts]), whole.samples['x1'])
+    parts = [full.crop(a, b) for a, b in itertools.pairwise(times)]
+    np.testing.assert_array_equal(np.concatenate([part.samples['x1'] for part in parts]), full.samples['x1'])
     topic = '/link_tip/deflection'
-    assert sum(len(part.estimates()[topic]) for part in parts) == len(whole.estimates()[topic])
+    assert sum(len(part.estimates()[topic]) for part in parts) == len(full.estimates()[topic])
     counted = [part.topics() for part in parts]
     assert counted[1][topic] > 40
-    assert all(sum(one.get(name, 0) for one in counted) <= count for name, count in whole.topics().items())
+    assert all(sum(one.get(name, 0) for one in counted) <= count for name, count in full.topics().items())
     # A part of a part counts from its own start, and a new block size cuts the same samples.
     inner = parts[1].crop(0.25, 0.5).with_block_size(10)
     assert isinstance(inner, RecordingWindow)
     assert len(inner.samples) == 250
-    assert inner.samples['seq'][0] == whole.samples['seq'][750]
+    assert inner.samples['seq'][0] == full.samples['seq'][750]
     assert {len(block.seq) for block in inner.blocks()} == {10}
 
 
@@ -115,9 +115,9 @@ def test_a_change_before_the_start_belongs_to_the_part(tmp_path: Path) -> None:
 
 
 def test_bounds_may_be_times_of_the_clock() -> None:
-    whole = psd_deflection.open(BAGS / 'clean')
-    start = datetime.fromtimestamp(int(whole.samples['t_ns'][0]) * 1e-9, UTC)
-    part = whole.crop(start + timedelta(seconds=1), start + timedelta(seconds=2))
+    full = psd_deflection.open(BAGS / 'clean')
+    start = datetime.fromtimestamp(int(full.samples['t_ns'][0]) * 1e-9, UTC)
+    part = full.crop(start + timedelta(seconds=1), start + timedelta(seconds=2))
     assert abs(len(part.samples) - 1000) <= 1
 
 
@@ -137,18 +137,18 @@ def test_a_part_without_samples_is_rejected(
 
 
 def test_a_part_is_written_and_studied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
+    full, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
     loads = [(0, 0, 0), (8, 0, 0), (0, 0, 0), (0, -8, 0), (0, 0, 0), (0, 0, 2), (0, 0, 0)]
     made = psd_deflection.simulate(None, loads, seconds=2, seed=2)
-    convert(made, whole, made.parameters, Beside.of(made), made.blocks())
-    assert main(['convert', str(whole), '--out', str(part), '--from', '0.5', '--to', '8']) == 0
+    convert(made, full, made.parameters, Beside.of(made), made.blocks())
+    assert main(['convert', str(full), '--out', str(part), '--from', '0.5', '--to', '8']) == 0
     assert '7500 samples' in capsys.readouterr().out
     np.testing.assert_array_equal(psd_deflection.open(part).samples['x1'],
-                                  psd_deflection.open(whole).crop(0.5, 8.0).samples['x1'])  # fmt: skip
-    assert main(['info', str(whole), '--from', '0.5', '--to', '8', '--json']) == 0
+                                  psd_deflection.open(full).crop(0.5, 8.0).samples['x1'])  # fmt: skip
+    assert main(['info', str(full), '--from', '0.5', '--to', '8', '--json']) == 0
     assert json.loads(capsys.readouterr().out)['samples'] == 7500
     # Without its last push the recording does not tell the wires of the twist.
-    assert main(['check', str(whole), '--to', '8', '--json']) == 0
+    assert main(['check', str(full), '--to', '8', '--json']) == 0
     assert json.loads(capsys.readouterr().out)['verdict'] != 'right'
 
 
@@ -216,13 +216,13 @@ def answer_without_names(text: str) -> object:
 def two_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A recording with loads, references and a link that rings, and a file with a part of it alone."""
     folder = tmp_path_factory.mktemp('parts')
-    whole, part = folder / 'whole.csv', folder / 'part.csv'
+    full, part = folder / 'whole.csv', folder / 'part.csv'
     rest = (0, 0, 0)
     loads = [rest, (20, 0, 0), rest, (0, -30, 0), rest, (0, 0, 2), rest, (30, 0, 0)]
     made = psd_deflection.simulate(None, loads, seconds=1, seed=2)
-    convert(made, whole, made.parameters, Beside.of(made), made.blocks())
-    assert main(['convert', str(whole), '--out', str(part), '--from', '0.5', '--to', '5.5']) == 0
-    return whole, part
+    convert(made, full, made.parameters, Beside.of(made), made.blocks())
+    assert main(['convert', str(full), '--out', str(part), '--from', '0.5', '--to', '5.5']) == 0
+    return full, part
 
 
 @pytest.mark.repeatable
@@ -234,25 +234,25 @@ def test_the_answer_of_a_part_is_that_of_a_file_with_the_part_alone(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    whole, part = (str(path) for path in two_files)
+    full, part = (str(path) for path in two_files)
     answers: list[object] = []
-    for recording in ([whole, '--from', '0.5', '--to', '5.5'], [part], [whole]):
+    for recording in ([full, '--from', '0.5', '--to', '5.5'], [part], [full]):
         folder = tmp_path / str(len(answers))
         folder.mkdir()
         monkeypatch.chdir(folder)
         capsys.readouterr()
         assert main([name, *recording, *ASKED[name], '--json']) == 0
         answers.append(answer_without_names(capsys.readouterr().out))
-    of_the_part, of_the_file, of_the_whole = answers
+    of_the_part, of_the_file, of_all = answers
     assert of_the_part == of_the_file or name in ALL_BEFORE
-    assert of_the_part != of_the_whole
+    assert of_the_part != of_all
 
 
 def test_what_is_computed_from_a_part_says_which(two_files: tuple[Path, Path]) -> None:
-    whole = psd_deflection.open(two_files[0])
-    assert whole.crop(0.5, 5.5).name == 'whole.csv, from 0.5 s to 5.5 s'
-    assert whole.crop(0.5, None).crop(1.0, None).name == 'whole.csv, from 0.5 s, from 1 s'
-    found = psd_deflection.calibrate(whole.crop(0.5, 5.5), ROOT / 'config' / 'thesis_rig.yaml')
+    full = psd_deflection.open(two_files[0])
+    assert full.crop(0.5, 5.5).name == 'whole.csv, from 0.5 s to 5.5 s'
+    assert full.crop(0.5, None).crop(1.0, None).name == 'whole.csv, from 0.5 s, from 1 s'
+    found = psd_deflection.calibrate(full.crop(0.5, 5.5), ROOT / 'config' / 'thesis_rig.yaml')
     assert found.tree()['provenance']['recordings'][0]['name'] == 'whole.csv, from 0.5 s to 5.5 s'
 
 
@@ -261,8 +261,8 @@ def test_a_part_of_a_replay_is_what_it_is_in_the_whole(
     bag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Also where the part begins and ends within a block; what is rejected in it is counted, and no more."""
-    whole, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
-    assert main(['replay', str(BAGS / bag), '--out', str(whole), '--json']) == 0
+    full, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
+    assert main(['replay', str(BAGS / bag), '--out', str(full), '--json']) == 0
     everything = json.loads(capsys.readouterr().out)
     words = ['--from', '1.013', '--to', '2.505']
     assert main(['replay', str(BAGS / bag), *words, '--out', str(part), '--json', '--compare', '--strict']) in (0, 1)
@@ -270,7 +270,7 @@ def test_a_part_of_a_replay_is_what_it_is_in_the_whole(
     assert found['compared']['different'] == found['compared']['rounded']
     assert found['compared']['equal'] + found['compared']['rounded'] > 100
     assert found['compared']['only_recorded'] == found['compared']['only_replayed'] == 0
-    head, *rows = whole.read_text().splitlines()
+    head, *rows = full.read_text().splitlines()
     first, *others = part.read_text().splitlines()
     assert first == head
     start = int(next(psd_deflection.open(BAGS / bag).blocks()).t_ns[0])

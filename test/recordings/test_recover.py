@@ -52,7 +52,7 @@ def theirs(folder: Path) -> dict[str, list[tuple[int, bytes]]]:
 
 
 @pytest.fixture(scope='module')
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp('recover') / 'run')
 
 
@@ -60,11 +60,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @settings(max_examples=25)
 @given(part=st.floats(0.05, 1.0))
 def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
-    whole: Path, tmp_path_factory: pytest.TempPathFactory, part: float
+    full: Path, tmp_path_factory: pytest.TempPathFactory, part: float
 ) -> None:
     folder = tmp_path_factory.mktemp('cut') / 'run'
     folder.mkdir()
-    content = (whole / 'run_0.mcap').read_bytes()
+    content = (full / 'run_0.mcap').read_bytes()
     (folder / 'run_0.mcap').write_bytes(content)
     cut(folder, 'run_0.mcap', int(part * len(content)))
     before = {(m.channel.topic, m.log_time, m.cdr) for m in open_recording(folder).messages()}
@@ -75,9 +75,9 @@ def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
     assert after.complete
     assert not after.warnings
     # The rig is the first message: what has any has it.
-    assert after.parameters == (open_recording(whole).parameters if before else {})
+    assert after.parameters == (open_recording(full).parameters if before else {})
     assert after.hello == (HELLO if before else None)
-    got, expected = theirs(folder), theirs(whole)
+    got, expected = theirs(folder), theirs(full)
     for topic, messages in got.items():
         assert messages == expected[topic][: len(messages)]
     assert sum(map(len, got.values())) == len(before)
@@ -86,15 +86,15 @@ def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
 
 
 def test_recover_reports_its_work_and_keeps_complete_files(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    full: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = {p.name: p.read_bytes() for p in whole.iterdir()}
-    assert main(['recover', str(whole)]) == 0
+    before = {p.name: p.read_bytes() for p in full.iterdir()}
+    assert main(['recover', str(full)]) == 0
     assert 'was intact' in capsys.readouterr().out
-    assert {p.name: p.read_bytes() for p in whole.iterdir()} == before
+    assert {p.name: p.read_bytes() for p in full.iterdir()} == before
 
 
-def test_recover_rewrites_missing_metadata_identically(whole: Path, tmp_path: Path) -> None:
+def test_recover_rewrites_missing_metadata_identically(full: Path, tmp_path: Path) -> None:
     folder = record(tmp_path / 'run')
     expected = yaml.safe_load((folder / 'metadata.yaml').read_text())
     (folder / 'metadata.yaml').unlink()

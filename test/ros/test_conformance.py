@@ -374,7 +374,7 @@ PROFILES: Mapping[str, Profile] = {
 
 
 @pytest.fixture(scope='module')
-def whole_peer(domain: int) -> Iterator[Peer]:
+def complete_peer(domain: int) -> Iterator[Peer]:
     one = Peer()
     yield one
     one.close()
@@ -382,12 +382,12 @@ def whole_peer(domain: int) -> Iterator[Peer]:
 
 @pytest.fixture(scope='module', params=nodes_of_setup())
 def running(
-    request: pytest.FixtureRequest, whole_peer: Peer, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, complete_peer: Peer, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Running]:
     name = request.param
     assert name in PROFILES, f'{name} is a node without a profile'
-    one = Running(name, whole_peer, tmp_path_factory.mktemp(name))
-    whole_peer.until(lambda: bool(one.reports), f'diagnostics of {name}')
+    one = Running(name, complete_peer, tmp_path_factory.mktemp(name))
+    complete_peer.until(lambda: bool(one.reports), f'diagnostics of {name}')
     yield one
     one.program.end()
     print(*one.program.lines[-30:], sep='\n')

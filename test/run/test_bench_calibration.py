@@ -45,9 +45,9 @@ class Bench:
 
     def grow(self) -> None:
         """Write the next part."""
-        (whole,) = self.bag.glob('*.mcap')
-        content = whole.read_bytes()
-        (self.folder / whole.name).write_bytes(content[: round(SHARES[self.written] * len(content))])
+        (full,) = self.bag.glob('*.mcap')
+        content = full.read_bytes()
+        (self.folder / full.name).write_bytes(content[: round(SHARES[self.written] * len(content))])
         self.written += 1
 
     def recording(self) -> bool:
@@ -67,18 +67,18 @@ class Bench:
 
 def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) -> None:
     bench = Bench(bag, tmp_path / 'growing')
-    first, half, whole = list(bench.steps())
+    first, half, full = list(bench.steps())
     # What was written by then holds no block.
     assert first.progress is None
     assert first.answer is None
     assert 'holds no samples' in first.words
     assert half.progress is not None
-    assert whole.progress is not None
-    assert (half.ended, whole.ended) == (False, True)
+    assert full.progress is not None
+    assert (half.ended, full.ended) == (False, True)
     assert half.progress.determined > 0
-    left = [sum(parameter.left for parameter in progress.parameters) for progress in (half.progress, whole.progress)]
+    left = [sum(parameter.left for parameter in progress.parameters) for progress in (half.progress, full.progress)]
     assert left[1] < left[0]
-    assert half.progress.seconds < whole.progress.seconds == pytest.approx(len(LOADS), abs=0.01)
+    assert half.progress.seconds < full.progress.seconds == pytest.approx(len(LOADS), abs=0.01)
     # It looks at what has grown only, and not more often than it says.
     assert bench.looks[1] - bench.looks[0] >= LEAST_PAUSE_S
     assert bench.looks == pytest.approx([0.0, 3.0, 5.0], abs=2 * LOOK_S)

@@ -27,7 +27,7 @@ _HALF_PI = (1.570796325802803, 9.920935791635221e-10, 5.170182981794105e-19)
 _PER_HALF_PI = 0.6366197723675814
 _LOG_2 = (0.6931471803691238, 1.9082149292705877e-10)
 _PER_LOG_2 = 1.4426950408889634
-_TO_WHOLE = 1.5 * 2.0**52
+_TO_INTEGER = 1.5 * 2.0**52
 """Added and taken off again, it rounds a float to the nearest whole number."""
 _FAR_ANGLE, _TURN = 1e6, 6.283185307179586
 """rad: of a larger angle whole turns are taken off first. Only a search that diverges asks for it."""
@@ -86,7 +86,7 @@ def _cos_near(r: Number) -> Number:
 
 def _reduced(x: Number) -> tuple[Number, Number]:
     """Quarter turns in ``x`` and what they leave."""
-    k = (x * _PER_HALF_PI + _TO_WHOLE) - _TO_WHOLE
+    k = (x * _PER_HALF_PI + _TO_INTEGER) - _TO_INTEGER
     return k, ((x - k * _HALF_PI[0]) - k * _HALF_PI[1]) - k * _HALF_PI[2]
 
 
@@ -176,7 +176,7 @@ class FixedFunctions(Arithmetic):
         """See :class:`Arithmetic`; 0 below -700."""
         if not x > -700.0:
             return 0.0 if x <= -700.0 else math.nan
-        k = (x * _PER_LOG_2 + _TO_WHOLE) - _TO_WHOLE
+        k = (x * _PER_LOG_2 + _TO_INTEGER) - _TO_INTEGER
         return ldexp(1.0 + _exp_series((x - k * _LOG_2[0]) - k * _LOG_2[1]), int(k))
 
     def expm1(self, x: float) -> float:
@@ -246,7 +246,7 @@ class FixedFunctions(Arithmetic):
     def exp_many(self, x: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
         within = np.maximum(x, -700.0)
-        k = (within * _PER_LOG_2 + _TO_WHOLE) - _TO_WHOLE
+        k = (within * _PER_LOG_2 + _TO_INTEGER) - _TO_INTEGER
         out = np.ldexp(1.0 + _exp_series((within - k * _LOG_2[0]) - k * _LOG_2[1]), np.nan_to_num(k).astype(np.int32))
         return np.asarray(np.where(np.asarray(x) <= -700.0, 0.0, out))
 

@@ -32,10 +32,10 @@ def lagged_products(series: FloatArray, lags: int) -> FloatArray:
     bits = (_MANTISSA - len(series).bit_length()) // 2
     powers = [math.frexp(largest)[1] - bits for largest in np.abs(series).max(axis=0).tolist()]
     units = np.array([math.ldexp(1.0, power) for power in powers])
-    whole = np.rint(series / units)
+    integers = np.rint(series / units)
     out = np.empty((count, count, lags))
     for lag in range(lags):
-        out[:, :, lag] = whole[: len(whole) - lag].T @ whole[lag:]
+        out[:, :, lag] = integers[: len(integers) - lag].T @ integers[lag:]
     return np.asarray(out * (units[:, None, None] * units[:, None]))
 
 

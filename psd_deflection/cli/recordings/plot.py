@@ -33,7 +33,7 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.formats.registry import endings_of_recordings
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
-from psd_deflection.recordings.spans import WHOLE, span_ns
+from psd_deflection.recordings.spans import FULL, span_ns
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -214,7 +214,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in warnings_about_rig(recording, args.params_file):
         warn(warning)
     window = EVER
-    if args.span != WHOLE:
+    if args.span != FULL:
         start_ns = next(int(block.t_ns[0]) for block in recording.blocks())
         window = span_ns(recording, start_ns, args.span)
         if window[0] >= window[1]:
@@ -227,7 +227,7 @@ def run(args: argparse.Namespace) -> int:
         if drawn.ended:
             break
     if not drawn.spots:
-        part = '' if args.span == WHOLE else ' between --from and --to'
+        part = '' if args.span == FULL else ' between --from and --to'
         raise RecordingError(f'{args.recording}: has no samples to draw{part}')
     summary = summarise(drawn, rig)
     with stage('drawing', quiet=args.json):

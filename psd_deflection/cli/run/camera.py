@@ -47,7 +47,7 @@ from psd_deflection.camera.targets import target_of
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder, picture_name, recording_name
 from psd_deflection.cli._report import print_json, show, warn
-from psd_deflection.cli._values import whole
+from psd_deflection.cli._values import integer
 from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.recordings.write.sinks import open_reference_file
 
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--params-file', metavar='CAMERA.yaml', help='target.spacing, target.radius, camera.matrix …')
     parser.add_argument('--out', metavar='OUT', help='X.csv, X.mcap or a bag folder')
-    parser.add_argument('--frames', type=whole('--frames', 1), metavar='N', help='stop after so many frames')
+    parser.add_argument('--frames', type=integer('--frames', 1), metavar='N', help='stop after so many frames')
     parser.add_argument(
         '--show', metavar='FILE.png', help='once a second, write the frame with what was found in it to this picture'
     )

@@ -32,7 +32,7 @@ from psd_deflection.base.files import creating
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder
 from psd_deflection.cli._report import print_json
-from psd_deflection.cli._values import whole
+from psd_deflection.cli._values import integer
 from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.rig.parameters import Value
 from psd_deflection.run.chain import ChainSession, Composed
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--slopes', choices=SLOPES, help='where the tilts of the tips come from (docs/chains.md)')
     parser.add_argument('--out', metavar='X.csv', help="write the end effector's deflection; needs --no-ros")
     parser.add_argument('--json', action='store_true', help='print one JSON object a block; needs --no-ros')
-    parser.add_argument('--count', type=whole('--count', 1), metavar='N', help='end after N blocks; needs --no-ros')
+    parser.add_argument('--count', type=integer('--count', 1), metavar='N', help='end after N blocks; needs --no-ros')
     parser.add_argument('--no-ros', action='store_true', help='acquire, compose and record without ROS')
     parser.add_argument('--ros-args', action='store_true', help='arguments after this go to ROS')
 

@@ -27,7 +27,7 @@ from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._daemon import daemon_of, url_option
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.cli._values import whole
+from psd_deflection.cli._values import integer
 from psd_deflection.run.monitor.served import need_server
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ SHOWN = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', M
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('--count', type=whole('--count', 1), metavar='N', help='end after N blocks')
+    parser.add_argument('--count', type=integer('--count', 1), metavar='N', help='end after N blocks')
     parser.add_argument(
         '--json',
         action='store_true',

@@ -43,7 +43,7 @@ from psd_deflection.cli._report import warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import open_for_replay, part_of, replayed, warnings_about_rig
-from psd_deflection.recordings.spans import WHOLE
+from psd_deflection.recordings.spans import FULL
 from psd_deflection.records import Record
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.declarations import MONITOR
@@ -98,7 +98,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f'--speed {args.speed:g}: must be above 0')
     reject_demo(args)
     if args.recording is None:
-        if args.span != WHOLE:
+        if args.span != FULL:
             raise UsageError('--from and --to are for a recording: give REC')
         reject(args, {'speed': 1.0, 'loop': False, 'namespace': None}, 'is for a recording: give REC')
     for name in ('port', 'baud', 'record', 'demo'):

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from psd_deflection.cli._options import in_the_world, reject
 from psd_deflection.cli._program import program
-from psd_deflection.cli._values import given_as_option, number, whole
+from psd_deflection.cli._values import given_as_option, integer, number
 from psd_deflection.devices.device import PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         '--first-seq',
-        type=whole('--first-seq', 0, 2**32 - 1),
+        type=integer('--first-seq', 0, 2**32 - 1),
         metavar='N',
         default=0,
         help='sample number at power-up (default 0)',

@@ -28,7 +28,7 @@ from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._options import PICTURES, make_writable, need_folder, picture_or_folder, reject
 from psd_deflection.cli._report import save_figure, show, show_text
-from psd_deflection.cli._values import given_as_option, need_finite, seed, whole
+from psd_deflection.cli._values import given_as_option, integer, need_finite, seed
 from psd_deflection.cli.studies._answer import answer, print_answer
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--inputs', metavar='FILE.yaml', help='a file of inputs')
     parser.add_argument(
         '--monte-carlo',
-        type=whole('--monte-carlo', 100, MAX_DRAWS),
+        type=integer('--monte-carlo', 100, MAX_DRAWS),
         metavar='N',
         help='check the totals with N random draws of all causes (at least 100)',
     )

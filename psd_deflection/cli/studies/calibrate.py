@@ -59,7 +59,7 @@ from psd_deflection.cli._values import number
 from psd_deflection.cli.studies._calibrate_live import calibrate_live
 from psd_deflection.model.misalignment.rig import is_calibrated
 from psd_deflection.model.simulation.catalogue import effects_of_rig
-from psd_deflection.recordings.spans import WHOLE
+from psd_deflection.recordings.spans import FULL
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.run.fleet.parquet import Field
@@ -134,7 +134,7 @@ def _reject_mixed(args: argparse.Namespace) -> None:
             f'give one for each, in the same order'
         )
     if args.live:
-        if args.recordings or args.span != WHOLE:
+        if args.recordings or args.span != FULL:
             raise UsageError('REC, --from, --to: --live makes a recording of its own and takes all of it')
         made: dict[str, object] = {
             'check': None,

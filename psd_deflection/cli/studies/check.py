@@ -40,7 +40,7 @@ from psd_deflection.cli._report import LONGEST_LINE, show
 from psd_deflection.cli.studies._answer import answer, answer_arguments
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
-from psd_deflection.recordings.spans import WHOLE
+from psd_deflection.recordings.spans import FULL
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.run.guided import run_guided
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         if not args.json:
             show(f'{args.recording}: {observed.duration:.1f} s')
     else:
-        if args.span != WHOLE:
+        if args.span != FULL:
             raise UsageError('--from, --to: are for a recording: give REC')
         found = _guided(args)
     return answer(args, found)

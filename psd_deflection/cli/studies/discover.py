@@ -62,7 +62,7 @@ from psd_deflection.cli._values import given_as_option, seed
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names
 from psd_deflection.model.simulation.load_words import load_history
-from psd_deflection.recordings.spans import WHOLE
+from psd_deflection.recordings.spans import FULL
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.discover.conclusion import adopting_folder
@@ -151,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f'--adopt {error}') from None
     if tables := asked.tables(args.recordings, warn):
         reject(args, {'next': False, 'adopt': None}, 'is for recordings of samples, not for readings of a link at rest')
-        if args.span != WHOLE:
+        if args.span != FULL:
             raise UsageError('--from, --to: are for recordings of samples, not for readings of a link at rest')
         make_writable(args.out)
         with stage('searching', quiet=args.quiet or args.json):
@@ -173,7 +173,7 @@ def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
     if args.recordings:
         raise UsageError(f'{args.recordings[0]}: --isolable {args.isolable} needs no recording')
     reject(args, {'adopt': None, 'each': False, 'next': False, 'make_it': False, 'namespace': None}, 'needs a REC')
-    if args.span != WHOLE:
+    if args.span != FULL:
         raise UsageError('--from, --to: need a REC')
     rig = asked.rig() or load_rig()
     with given_as_option():

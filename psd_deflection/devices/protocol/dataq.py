@@ -111,8 +111,8 @@ def find_reply(received: bytes, asked: str) -> str | None:
     A reply ends with a carriage return, and zeros may pad it. Scans that were still in transit may
     come before the echo.
     """
-    whole, _, _ = received.rpartition(b'\r')
-    for line in reversed(whole.replace(b'\x00', b'').split(b'\r')):
+    complete, _, _ = received.rpartition(b'\r')
+    for line in reversed(complete.replace(b'\x00', b'').split(b'\r')):
         text = line.decode('ascii', 'replace').strip()
         at = text.rfind(asked)
         if at >= 0:

@@ -33,7 +33,7 @@ READINGS = 3
 ELECTRODES = 4
 """Readings of one PSD."""
 _COUNTS = frozenset(of * n for n in range(2, MOST_PSDS + 1) for of in (READINGS, ELECTRODES))
-_WHOLE = re.compile(rb'-?\d{1,10}')
+_INTEGER = re.compile(rb'-?\d{1,10}')
 _DECIMAL = re.compile(rb'[+-]?(\d{1,9}(\.\d{0,9})?|\.\d{1,9})')
 MAX_VOLTS = 1e3
 LEAST = -WRAP // 2
@@ -83,7 +83,7 @@ def parse(line: bytes) -> Item | None:
     fields = [f.strip() for f in line.split(b',')]
     if len(fields) - 2 not in _COUNTS:
         return BadFrame('no number of fields that a sample has', size)
-    if not (_WHOLE.fullmatch(fields[0]) and _WHOLE.fullmatch(fields[1])):
+    if not (_INTEGER.fullmatch(fields[0]) and _INTEGER.fullmatch(fields[1])):
         return BadFrame('seq or t_us is no whole number', size)
     seq, t_us = int(fields[0]), int(fields[1])
     if not (LEAST <= seq < WRAP and LEAST <= t_us < WRAP):

@@ -16,7 +16,7 @@ from psd_deflection.base.sanitize import sanitize
 MAX_TEXT = 200
 """Characters of one text. A longer one is cut."""
 
-MAX_WHOLE = 1 << 53
+MAX_INTEGER = 1 << 53
 """Whole numbers beyond it are not exact in JSON, and are kept as text."""
 
 MAX_DEPTH = 3
@@ -48,7 +48,7 @@ def _harmless(value: object, depth: int) -> object:
             return value
         case str():
             return sanitize(value, MAX_TEXT)
-        case int() if abs(value) <= MAX_WHOLE:
+        case int() if abs(value) <= MAX_INTEGER:
             return value
         case float() if math.isfinite(value):
             return value

@@ -136,11 +136,11 @@ class BlockTables:
         self._covariance = noise[:, None] + self._xp.einsum('akc,acnm->aknm', rates, self._random_walk)
         self._reach = self._xp.einsum('akc,acin->akin', rates, self._to_end)
         self.added = self._xp.einsum('akc,acij->akij', rates, self._spread)
-        self._whole = self._of(np.arange(self.size))
+        self._full = self._of(np.arange(self.size))
 
     def gains(self, slots: IntArray) -> BlockGains:
         """What the samples at ``slots`` (n,) of the block say. A whole block is at hand, others are computed."""
-        return self._whole if len(slots) == self.size else self._of(slots)
+        return self._full if len(slots) == self.size else self._of(slots)
 
     def _of(self, slots: IntArray) -> BlockGains:
         covariance = self._covariance[:, :, slots[:, None], slots]

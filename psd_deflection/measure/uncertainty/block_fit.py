@@ -103,13 +103,13 @@ def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
 class _Vibration(NamedTuple):
     """A tone as the fit meets it: in its combinations, ``covariance`` (C, C) m^2.
 
-    ``waves`` (2, N): cosine and sine about the middle of the block. ``whole`` (C, K): what ``u`` of a whole block
+    ``waves`` (2, N): cosine and sine about the middle of the block. ``full`` (C, K): what ``u`` of a whole block
     makes of the cosine; of the sine its symmetric weights make nothing.
     """
 
     covariance: FloatArray
     waves: FloatArray
-    whole: FloatArray
+    full: FloatArray
 
 
 class _Terms(NamedTuple):
@@ -213,9 +213,9 @@ class BlockFit:
         self._between = np.lib.stride_tricks.sliding_window_view(both, self._size, axis=2)[:, :, :, ::-1]
         own = turned[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=self._size > LARGEST)
-        self._whole = _terms(self._q, self._precision, self._middle, None, xp)
-        u = self._whole.u
-        self._of_whole = xp.einsum('ask,absj->kjab', u, xp.einsum('abts,btj->absj', self._between, u))
+        self._full = _terms(self._q, self._precision, self._middle, None, xp)
+        u = self._full.u
+        self._of_full = xp.einsum('ask,absj->kjab', u, xp.einsum('abts,btj->absj', self._between, u))
         self._vibrations = [self._vibration(tone) for tone in tones]
 
     def _vibration(self, tone: Tone) -> _Vibration:
@@ -223,13 +223,13 @@ class BlockFit:
         angle = np.asarray(2.0 * pi * tone.frequency * (np.arange(self._size) - 0.5 * (self._size - 1)), np.float64)
         waves = np.stack((xp.cos_many(angle), xp.sin_many(angle)))
         covariance = xp.einsum('ac,cd,bd->ab', turn, tone.covariance, turn)
-        return _Vibration(covariance, waves, xp.einsum('ask,s->ak', self._whole.u, waves[0]))
+        return _Vibration(covariance, waves, xp.einsum('ask,s->ak', self._full.u, waves[0]))
 
     def _left_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
         """Covariance (B, C, C), m^2, of what the answers leave of a tone; ``weights`` (B, C, N) of blocks with gaps."""
         xp = self._xp
         if weights is None:
-            left = 1.0 - xp.einsum('kza,ak->za', x, vibration.whole)
+            left = 1.0 - xp.einsum('kza,ak->za', x, vibration.full)
             return np.asarray(vibration.covariance * (left[:, :, None] * left[:, None, :]))
         kept = xp.einsum('zas,ws->wza', weights, vibration.waves)
         left, sine = 1.0 - kept[0], kept[1]
@@ -245,17 +245,17 @@ class BlockFit:
 
         The state is that after the block that was taken last. Noise that is set in between counts from the next one.
         """
-        whole = len(slots) == self._size
+        full = len(slots) == self._size
         # Sums over more numbers than that take another order.
-        most = max(AT_ONCE // dots[0].size, 1) if whole else 1
+        most = max(AT_ONCE // dots[0].size, 1) if full else 1
         at = 0
         while at < len(dots):
-            terms = self._whole
+            terms = self._full
             for memory, fitted in self._together(slots, dots[at : at + most]):
                 self._memory = memory
                 at += 1
                 yield fitted
-                if self._whole is not terms:
+                if self._full is not terms:
                     break
 
     def _together(self, slots: IntArray, dots: FloatArray) -> Iterator[tuple[_Memory, Fitted]]:
@@ -267,8 +267,8 @@ class BlockFit:
         # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
         offset = xp.sum(z, 0) / samples
         z = z - offset
-        whole = samples == self._size
-        terms = self._whole if whole else self._terms_without(slots)
+        full = samples == self._size
+        terms = self._full if full else self._terms_without(slots)
         orders, reported = self._orders, len(terms.v)
         observed = xp.einsum('sja,sza->jza', terms.all, z)
         c = observed[orders : orders + reported]
@@ -276,8 +276,8 @@ class BlockFit:
         x, missed = _weights(terms, motion, self._middle, xp)
         value = xp.sum(x * observed[:orders], 0) + offset
         weights: FloatArray | None = None
-        if whole:
-            covariance = xp.einsum('kza,kjab,jzb->zab', x, self._of_whole, x)
+        if full:
+            covariance = xp.einsum('kza,kjab,jzb->zab', x, self._of_full, x)
         else:
             weights = np.zeros((blocks, count, self._size))
             weights[:, :, slots] = xp.einsum('ask,kza->zas', terms.u, x)
@@ -319,7 +319,7 @@ class BlockFit:
         inner = inverse(p[:, gone[:, None], gone])
         xp = self._xp
         own = p[:, slots[:, None], slots] - xp.einsum('asg,atg->ast', xp.einsum('asg,agh->ash', cross, inner), cross)
-        return _terms(self._q[slots], own, self._middle, self._whole.v, xp)
+        return _terms(self._q[slots], own, self._middle, self._full.v, xp)
 
     def _motion(self, c: FloatArray, terms: _Terms) -> tuple[Sequence[_Memory], FloatArray]:
         """The memory after each block, and tau^2 (K, B, C) by it; of order 0 nothing is known beforehand.
@@ -329,7 +329,7 @@ class BlockFit:
         c = c.swapaxes(0, 1)
         if self._orders == 1:
             return [self._memory] * len(c), c.swapaxes(0, 1)
-        reported, usual_v = c.shape[1], self._whole.v
+        reported, usual_v = c.shape[1], self._full.v
         square = c * c
         excess = square - terms.v
         recent = _recent_after(self._memory.recent, excess, terms.sure)
@@ -342,7 +342,7 @@ class BlockFit:
         before, tau = usual[:-1], usual[1:].copy()
         sudden = square > _SUDDEN * (terms.v + before[:, :reported])
         np.maximum(excess, tau[:, :reported], out=tau[:, :reported], where=sudden)
-        if terms is not self._whole and reported > 1:
+        if terms is not self._full and reported > 1:
             self._believe(c, terms, tau)
         # What does not move with the link has no motion that this block alone tells of: that would be noise, chosen
         # for being large.

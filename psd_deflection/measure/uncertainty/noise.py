@@ -349,17 +349,17 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray, xp: Arithmet
     """Variance (c,) of ``series`` (n, c) about a polynomial in each block: the median over the blocks of a segment."""
     size, orders = q.shape
     blocks, slots = np.divmod(places, size)
-    whole = np.zeros((SEGMENT_BLOCKS, size, series.shape[1]))
+    full = np.zeros((SEGMENT_BLOCKS, size, series.shape[1]))
     here = np.zeros((SEGMENT_BLOCKS, size))
-    whole[blocks, slots] = series
+    full[blocks, slots] = series
     here[blocks, slots] = 1.0
     count = xp.sum(here, 1)
     enough = count >= orders + 2
-    whole, here, count = whole[enough], here[enough], count[enough]
-    whole = (whole - xp.sum(whole, 1)[:, None] / count[:, None, None]) * here[:, :, None]
+    full, here, count = full[enough], here[enough], count[enough]
+    full = (full - xp.sum(full, 1)[:, None] / count[:, None, None]) * here[:, :, None]
     gram = xp.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
-    h = xp.einsum('bsc,sk->bkc', whole, q)
-    left = xp.einsum('bsc,bsc->bc', whole, whole) - xp.einsum(
+    h = xp.einsum('bsc,sk->bkc', full, q)
+    left = xp.einsum('bsc,bsc->bc', full, full) - xp.einsum(
         'bkc,bkc->bc', h, xp.einsum('bkj,bjc->bkc', inverse(gram), h)
     )
     if not len(left):
@@ -392,8 +392,8 @@ def _autocovariance(
     # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
     # divisor: that of the lag at which gaps cost most, so that none is too small.
     present = present[:lags]
-    whole = present / (1.0 - np.arange(lags) / length)
-    return each[:, :, :lags] + taken, present / max(float(whole.min()), _PAIRS * float(whole[0]))
+    full = present / (1.0 - np.arange(lags) / length)
+    return each[:, :, :lags] + taken, present / max(float(full.min()), _PAIRS * float(full[0]))
 
 
 def _covariance(each: FloatArray, sure: FloatArray, xp: Arithmetic = FIXED) -> FloatArray:
@@ -416,8 +416,8 @@ def _positive(gamma: FloatArray, xp: Arithmetic) -> bool:
     count, _, size = gamma.shape
     both = np.concatenate((gamma.transpose(1, 0, 2)[:, :, :0:-1], gamma), axis=2)
     lags = np.arange(size) - np.arange(size)[:, None] + size - 1
-    whole = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
-    return bool(np.isfinite(whole).all()) and xp.is_positive(whole)
+    full = both[:, :, lags].transpose(0, 2, 1, 3).reshape(count * size, count * size)
+    return bool(np.isfinite(full).all()) and xp.is_positive(full)
 
 
 def undithered(variance: float, step: float, xp: Arithmetic = FIXED) -> float:

@@ -74,11 +74,11 @@ class VoltsToDots:
         # Reading by reading in memory: an order in which sums by the library are not other than they were.
         dots = np.multiply(volts.T.take(self._columns, axis=0).T, self._per_volt, dtype=np.float64)
         for i, (x, y, level) in self.dark:
-            whole = volts[:, 3 * i + 2].astype(np.float64)
-            laser = np.maximum(whole - level, LEAST_LASER * level)
+            full = volts[:, 3 * i + 2].astype(np.float64)
+            laser = np.maximum(full - level, LEAST_LASER * level)
             for column, dark in ((2 * i, x), (2 * i + 1, y)):
                 pull = level * dark * self.sensitivities[column]
-                dots[:, column] = (whole * dots[:, column] - pull) / laser
+                dots[:, column] = (full * dots[:, column] - pull) / laser
         for i, sensor in enumerate(self.sensors):
             if isinstance(sensor, Quadrant):
                 dots[:, 2 * i : 2 * i + 2] = sensor.from_linear(dots[:, 2 * i : 2 * i + 2])

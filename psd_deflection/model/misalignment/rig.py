@@ -82,9 +82,9 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
             continue
         for own, name in called.items():
             # Of one PSD an effect counts once, whatever its other choices are.
-            whole = f'psd_{active.values[PSD.name]:.0f}.{name}' if PSD in active.effect.parameters else name
+            full = f'psd_{active.values[PSD.name]:.0f}.{name}' if PSD in active.effect.parameters else name
             if active.values[own] != active.effect.parameter(own).nominal or name == _AIMED:
-                _claim(observed, whole, active)
+                _claim(observed, full, active)
             if name in clamp:
                 clamp[name] = active.values[own]
             elif name == _SLOPE:
@@ -92,7 +92,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
             elif name == _AIMED:
                 aimed[int(active.values[PSD.name]) - 1] = active.values[own]
             else:
-                v[INDEX[whole]] += active.values[own]
+                v[INDEX[full]] += active.values[own]
         listed.add(active.effect.name)
         tilts = tilts or _SLOPE in called.values()
     for i, psd in enumerate(rig.psds):
@@ -196,10 +196,10 @@ def rig_values(
         place = response_of(p, n - 1).place(p[ZERO + 2 * n - 2], p[ZERO + 2 * n - 1])
         values[f'psd_{n}.zero'] = [float(f'{x:.12g}') for x in place]
     # A clamp that gives less than nothing is the link's stiffness, not the clamp.
-    whole = {name: max(float(f'{clamp[name]:.12g}'), 0.0) for name in CLAMP} | {_SLOPE: float(p[SLOPE])}
+    full = {name: max(float(f'{clamp[name]:.12g}'), 0.0) for name in CLAMP} | {_SLOPE: float(p[SLOPE])}
     for effect, called in _written(vector.listed):
         if PSD not in effect.parameters:
-            _add(effects, effect, {key: whole[name] for key, name in called.items()})
+            _add(effects, effect, {key: full[name] for key, name in called.items()})
             continue
         for n in (1, 2):
             found = {key: float(p[INDEX[f'psd_{n}.{name}']]) for key, name in called.items()}

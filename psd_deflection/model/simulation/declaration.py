@@ -184,7 +184,7 @@ class Effect:
     blocks: empty at first, then always as many numbers. What ``configure`` changes needs no ``trace_back``.
     ``uses``: inputs of the correction besides dots and sums. ``order``: among the effects of one
     stage. ``finite``: the signature at the nominal value vanishes, so exactly the values of
-    ``grid`` are probed. ``whole``: ``apply`` must see the whole history at once, because a sample depends on later
+    ``grid`` are probed. ``full``: ``apply`` must see the whole history at once, because a sample depends on later
     ones; no effect of the catalogue does.
 
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
@@ -209,7 +209,7 @@ class Effect:
     trace_back: Callable[[Traced, Values, list[float]], None] | None = None
     uses: frozenset[Use] = frozenset()
     finite: bool = False
-    whole: bool = False
+    full: bool = False
     order: int = 0
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
     law: str = ''

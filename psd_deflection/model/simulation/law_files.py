@@ -47,7 +47,7 @@ def _law_of(tree: object, path: Path) -> Law:
     return dataclasses.replace(first, further=tuple(further))
 
 
-def _part(path: Path, at: str, tree: object, whole: Mapping[str, object]) -> Law:
+def _part(path: Path, at: str, tree: object, full: Mapping[str, object]) -> Law:
     """What the law does to one target; ``at``: where in the file."""
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: {at.rstrip(".")} = {tree!r}: must be a map with acts_on and terms')
@@ -64,7 +64,7 @@ def _part(path: Path, at: str, tree: object, whole: Mapping[str, object]) -> Law
         raise ConfigError(f'{path}: {at}terms: jitter stands alone; write a law of its own for the other terms')
     if terms[0].kind == 'variance' and acts_on not in (*DOTS, *SUMS):
         raise ConfigError(f'{path}: {at}acts_on = {acts_on!r}: jitter acts on x1, y1, sum1 and those of the other PSDs')
-    return Law(str(whole['name']), cast(Stage, stage), acts_on, terms, str(tree.get('summary', '')))
+    return Law(str(full['name']), cast(Stage, stage), acts_on, terms, str(tree.get('summary', '')))
 
 
 def _one_of(path: Path, key: str, value: object, allowed: Mapping[str, object] | Sequence[str]) -> str:

@@ -58,9 +58,9 @@ def rate(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArr
     """Derivative of v in time."""
     # Backward, second order: what comes later is not known.
     before = state.get('v', np.full(2, v[0]))
-    whole = np.concatenate((before, v))
-    state['v'] = whole[-2:]
-    return (1.5 * whole[2:] - 2.0 * whole[1:-1] + 0.5 * whole[:-2]) / period
+    full = np.concatenate((before, v))
+    state['v'] = full[-2:]
+    return (1.5 * full[2:] - 2.0 * full[1:-1] + 0.5 * full[:-2]) / period
 
 
 def rate_absolute(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:

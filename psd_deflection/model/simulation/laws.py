@@ -421,15 +421,15 @@ def effect_of(law: Law) -> Effect:
     )
 
 
-def _part(whole: Law, law: Law, first: int) -> Effect:
-    """What ``law``, whose terms are counted from ``first``, does of the ``whole``."""
+def _part(full: Law, law: Law, first: int) -> Effect:
+    """What ``law``, whose terms are counted from ``first``, does of the ``full``."""
     variance = law.kind == 'variance'
     uses = cast('frozenset[Use]', frozenset(law.variables) & frozenset(('time', 'temperature')))
     correctable = _correctable(law) and not variance
     return Effect(
-        name=whole.name,
+        name=full.name,
         stage=law.stage,
-        summary=whole.summary or f'an empirical law on {", ".join(part.acts_on for part in whole.parts)}',
+        summary=full.summary or f'an empirical law on {", ".join(part.acts_on for part in full.parts)}',
         equation=law.expression,
         source='empirical: found by psd-deflection discover',
         needs='',

@@ -168,7 +168,7 @@ class ForwardModel:
         in the processor's cache.
         """
         n = len(loads)
-        size = n if any(active.effect.whole for active in self.effects) else max(1, PIECE // unit) * unit
+        size = n if any(active.effect.full for active in self.effects) else max(1, PIECE // unit) * unit
         for first in range(0, n, max(1, size)):
             at = slice(first, min(first + size, n))
             yield at, self.expect(loads[at], None if temperature is None else temperature[at]).volts

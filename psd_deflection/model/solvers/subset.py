@@ -65,9 +65,9 @@ class PoseOfFew(Solver):
 
 def geometry_of(rig: Rig, kept: Sequence[int]) -> Geometry:
     """The geometry of the PSDs ``kept`` (from 0)."""
-    whole = Geometry.from_rig(rig)
+    full = Geometry.from_rig(rig)
     at = list(kept)
-    return replace(whole, centers=whole.centers[at], zeros=whole.zeros[at], heights=whole.heights[at])
+    return replace(full, centers=full.centers[at], zeros=full.zeros[at], heights=full.heights[at])
 
 
 def subset_solver(name: str, rig: Rig, kept: Sequence[int]) -> Solver | None:

@@ -42,7 +42,7 @@ from msg_adapters.header import header, stamp_ns
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.base.sequence import RecordedSequence
-from psd_deflection.measure.state import WHOLE
+from psd_deflection.measure.state import FULL
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.allowance import Warnings
@@ -285,12 +285,12 @@ class BagRecording(Recording):
             together = joined_points(messages)
             parts = (
                 [together]
-                if count.follows(together.seq, together.t_ns, together.whole)
+                if count.follows(together.seq, together.t_ns, together.full)
                 else [joined_points([m]) for m in messages]
             )
             for part in parts:
                 try:
-                    seq = count.extended(part.seq, part.t_ns, part.whole)
+                    seq = count.extended(part.seq, part.t_ns, part.full)
                 except ValueError as error:
                     raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
                 _, _, t_ns, volts, flags = part
@@ -431,7 +431,7 @@ def _memory_in(state: RigState) -> ParameterChange | None:
     """All that the pipeline remembers, as a change from which another one goes on; None if it is not told."""
     if state.memory is None:
         return None
-    return _to_change(state.t_ns, state.block, {WHOLE: 1.0, **state.memory})
+    return _to_change(state.t_ns, state.block, {FULL: 1.0, **state.memory})
 
 
 def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]], marks: tuple[Mark, ...]) -> EstimateSeries:

@@ -82,10 +82,10 @@ def _learn(message: bytes, dtype: np.dtype[np.void]) -> _CloudLayout:
 class Samples(NamedTuple):
     """Samples in order: ``seq`` int64 (n,), ``t_ns`` (n,), ``volts`` (n, 3P), ``flags`` (n,).
 
-    ``whole``: False if ``seq`` is modulo 2^32.
+    ``full``: False if ``seq`` is modulo 2^32.
     """
 
-    whole: bool
+    full: bool
     seq: IntArray
     t_ns: IntArray
     volts: npt.NDArray[np.float32]
@@ -99,12 +99,12 @@ def joined_points(messages: Sequence[tuple[int, npt.NDArray[np.void]]]) -> Sampl
     stamps = np.repeat([stamp for stamp, _ in messages], [len(p) for _, p in messages])
     names = points.dtype.names or ()
     seq = points['seq'].astype(np.uint32).astype(np.int64)
-    whole = 'seq_high' in names
-    if whole:
+    full = 'seq_high' in names
+    if full:
         # 31 more bits are always enough, and no file can make the number negative.
         seq += (points['seq_high'].astype(np.int64) & 0x3FFFFFFF) << 32
     return Samples(
-        whole,
+        full,
         seq,
         stamps + points['dt'].astype(np.int64),
         np.stack([points[c] for c in channel_names(point_cloud2.psds_of(points))], axis=1).astype(np.float32),

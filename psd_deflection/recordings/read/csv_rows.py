@@ -110,10 +110,10 @@ class SampleRows(CsvTable):
             return None
         decimals = len(cells[0].partition('.')[2])
         if {cell[-1 - decimals : -decimals] for cell in cells} == {'.'}:
-            whole = together.replace('.', '').split('\n')
-            whole.pop()
+            digits = together.replace('.', '').split('\n')
+            digits.pop()
             scale = 10 ** (9 - decimals)
-            return [scale * t for t in map(int, whole)]
+            return [scale * t for t in map(int, digits)]
         return [self._nanoseconds(cell, 0) for cell in cells]
 
     def _any(self, begin: int, line: int, last: int) -> Iterator[CsvRows]:

@@ -14,7 +14,7 @@ from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.recordings.formats.format import ReadOptions
 from psd_deflection.recordings.formats.registry import format_of_content, formats
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.spans import WHOLE, Span
+from psd_deflection.recordings.spans import FULL, Span
 
 MOST_NAMES = 1000
 """Names of a folder that are looked at for one that was meant."""
@@ -26,7 +26,7 @@ def open_recording(
     block_size: int | None = None,
     sample_rate_hz: float | None = None,
     namespace: str | None = None,
-    span: Span = WHOLE,
+    span: Span = FULL,
 ) -> Recording:
     """Open ``path``: a bag folder, a lone ``.mcap`` or a ``.csv``.
 
@@ -37,8 +37,8 @@ def open_recording(
     cannot be loaded.
     """
     options = ReadOptions(block_size=block_size, sample_rate_hz=sample_rate_hz, namespace=namespace)
-    whole = _open(Path(path), options)
-    return whole if span == WHOLE else whole.crop(*span)
+    full = _open(Path(path), options)
+    return full if span == FULL else full.crop(*span)
 
 
 def _open(path: Path, options: ReadOptions) -> Recording:

@@ -21,7 +21,7 @@ import numpy as np
 
 from msg_adapters import DIAGNOSTICS, FILTERED, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.measure.state import WHOLE
+from psd_deflection.measure.state import FULL
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import differences, provenance
 from psd_deflection.recordings.recording import Recording, RecordingWindow
@@ -114,7 +114,7 @@ class ReplayComparison:
         newest = 0
         for record in records:
             if isinstance(record, ParameterChange):
-                if self._newest and any(name == WHOLE for name, _ in record.values):
+                if self._newest and any(name == FULL for name, _ in record.values):
                     self._begin(record)
                 continue
             for topic, type_name, t_ns, fields in to_messages(record, self._frame_prefix):

@@ -23,7 +23,7 @@ from psd_deflection.measure.pipeline import Pipeline, zero_variances
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording, RecordingWindow
-from psd_deflection.recordings.spans import WHOLE, Span
+from psd_deflection.recordings.spans import FULL, Span
 from psd_deflection.recordings.summary import NO_PARAMETERS
 from psd_deflection.records import (
     ENVIRONMENT,
@@ -78,7 +78,7 @@ def warnings_about_rig(recording: Recording, params_file: str | None = None) -> 
 
 
 def open_for_replay(
-    path: str | Path, params_file: str | None = None, namespace: str | None = None, span: Span = WHOLE
+    path: str | Path, params_file: str | None = None, namespace: str | None = None, span: Span = FULL
 ) -> tuple[Recording, Rig]:
     """The recording, cut into the rig's blocks, and the rig: from ``params_file``, else from the recording.
 
@@ -96,7 +96,7 @@ def open_for_replay(
 
 def part_of(recording: Recording, span: Span) -> RecordingWindow | None:
     """The part of ``recording`` that is meant, None if that is the whole. Raises as :meth:`Recording.crop` does."""
-    return None if span == WHOLE else RecordingWindow(recording, *span)
+    return None if span == FULL else RecordingWindow(recording, *span)
 
 
 def check_psds(recording: Recording, rig: Rig) -> None:

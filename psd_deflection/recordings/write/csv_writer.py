@@ -36,8 +36,8 @@ WRENCH_COLUMNS = ('fx', 'fy', 'tz')
 
 def seconds(t_ns: int) -> str:
     """``t_ns`` as seconds with nine decimals, exactly."""
-    whole, part = divmod(t_ns, 1_000_000_000)
-    return f'{whole}.{part:09d}'
+    s, part = divmod(t_ns, 1_000_000_000)
+    return f'{s}.{part:09d}'
 
 
 class _CsvFile:

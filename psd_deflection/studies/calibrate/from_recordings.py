@@ -17,7 +17,7 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import References, read_references, references_in
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds
-from psd_deflection.recordings.spans import WHOLE, Span
+from psd_deflection.recordings.spans import FULL, Span
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -37,7 +37,7 @@ def read_run(
     reference: str | Path | None = None,
     exposure: float = 0.0,
     namespace: str | None = None,
-    span: Span = WHOLE,
+    span: Span = FULL,
 ) -> CalibrationRun:
     """Return one recording: the recording or its path. Raises RecordingError if it cannot be read.
 
@@ -96,7 +96,7 @@ def read_runs(
     references: Sequence[str | Path] = (),
     exposure: float = 0.0,
     namespace: str | None = None,
-    span: Span = WHOLE,
+    span: Span = FULL,
 ) -> list[CalibrationRun]:
     """Return all of ``sources``; ``references``: none, or the reference of each."""
     tables: Sequence[str | Path | None] = references or [None] * len(sources)
@@ -144,7 +144,7 @@ class CalibrationOptions:
     references: tuple[str | Path, ...] = ()
     dark: tuple[Recording | str | Path, ...] = ()
     date: str = field(default_factory=today)
-    span: Span = WHOLE
+    span: Span = FULL
 
     def rig(self, recordings: Sequence[Recording | str | Path], notify: Notify) -> Rig:
         """Return the known rig; ``notify`` gets a warning if neither a file nor the recording names one."""

@@ -27,7 +27,7 @@ from psd_deflection.recordings.read.readings_table import (
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig, zero_variances_at_end
 from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN
-from psd_deflection.recordings.spans import WHOLE, Span
+from psd_deflection.recordings.spans import FULL, Span
 from psd_deflection.records import FloatArray, channel_names, dot_channels
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -47,7 +47,7 @@ def read_observation(
     where: str = 'overrides',
     *,
     namespace: str | None = None,
-    span: Span = WHOLE,
+    span: Span = FULL,
     warn: Callable[[str], None] | None = None,
     any_rate: bool = False,
 ) -> Observation:
@@ -158,7 +158,7 @@ def read_observations(
     rig: Rig | None = None,
     *,
     namespace: str | None = None,
-    span: Span = WHOLE,
+    span: Span = FULL,
     warn: Callable[[str], None] | None = None,
     any_rate: bool = False,
 ) -> list[Observation]:
@@ -327,7 +327,7 @@ class DiscoverOptions:
     namespace: str | None = None
     seed: int = 0
     without: tuple[str, ...] = ()
-    span: Span = WHOLE
+    span: Span = FULL
 
     @property
     def params_file(self) -> str | Path | None:
@@ -364,6 +364,6 @@ class DiscoverOptions:
 
         Raises RecordingError if a part of a table is asked for.
         """
-        if self.span != WHOLE:
+        if self.span != FULL:
             raise RecordingError(f'{tables[0].name}: holds readings of a link at rest: take all of it')
         return discover_in(ReadingsPlant(tables, self.without, self.params_file, notify), seed=self.seed)

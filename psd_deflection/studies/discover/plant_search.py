@@ -96,7 +96,7 @@ class PlantComparison(Comparison):
         self.known = np.array(plant.noise or (0.0,) * len(plant.channels))
         self.shares = len(set(plant.units)) > 1 and not plant.levers
         self.levers = np.array(plant.levers or (1.0,) * len(plant.channels))
-        self.whole = np.ones(len(plant.channels))
+        self.full = np.ones(len(plant.channels))
         self.level = np.ones(len(plant.channels))
         self.independent = np.ones(len(plant.channels))
         self.level, self.independent = self._noise_beside(self.nuisance)
@@ -258,7 +258,7 @@ class PlantComparison(Comparison):
 
     def _joined(self, gaps: FloatArray) -> float:
         if self.shares:
-            return float(np.sqrt(np.mean((gaps / self.whole)[self.total > 0] ** 2)))
+            return float(np.sqrt(np.mean((gaps / self.full)[self.total > 0] ** 2)))
         return float(np.sqrt(np.sum(self.total * (self.levers * gaps) ** 2) / self.total.sum()))
 
     def gap(self, residual: Sequence[FloatArray]) -> float:
@@ -314,7 +314,7 @@ class PlantComparison(Comparison):
     def begun(self, null: Fit) -> Self:
         """With what the fit without any effect leaves as the gap before."""
         gap_before = np.maximum(self.gap_per_channel(null.difference), 1e-300)
-        return self.replaced(whole=gap_before).renoised([*self.base, *null.coefficients_with_nuisance])
+        return self.replaced(full=gap_before).renoised([*self.base, *null.coefficients_with_nuisance])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

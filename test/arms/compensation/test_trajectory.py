@@ -90,8 +90,8 @@ def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
     second = by.shape(round(now * S), back, ZERO)
     # No step where it is replaced, nor later; a step is more than the fastest goes in 2 ms.
     at = np.arange(0.0, second.duration, 0.002)
-    whole = np.concatenate([first.at(np.arange(0.0, now, 0.002))[:, 0], second.at(at)[:, 0]])
-    assert np.abs(np.diff(whole, axis=0)).max() < 0.002 * 5.0
+    full = np.concatenate([first.at(np.arange(0.0, now, 0.002))[:, 0], second.at(at)[:, 0]])
+    assert np.abs(np.diff(full, axis=0)).max() < 0.002 * 5.0
     # It is what the history asks for.
     history = [moved(orders).at(np.minimum(at + now - t, now))[:, 0] for t in ZVD.times]
     wanted = sum(

@@ -24,7 +24,7 @@ def test_any_payload_is_encoded_as_the_judge_does_and_comes_back(payload: bytes)
     assert decode(encoded) == payload
 
 
-@given(st.binary(max_size=600) | PAYLOADS.map(encode).map(lambda whole: whole[:-1]))
+@given(st.binary(max_size=600) | PAYLOADS.map(encode).map(lambda full: full[:-1]))
 def test_any_bytes_are_decoded_or_rejected_as_the_judge_does(encoded: bytes) -> None:
     try:
         expected = oracle.decode(encoded)

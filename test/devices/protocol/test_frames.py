@@ -193,15 +193,15 @@ def test_what_is_encoded_is_decoded(frame: GoodFrame) -> None:
 
 @given(streams, st.lists(st.integers(0, 2000), max_size=20))
 def test_any_split_of_the_stream_gives_the_same_frames(stream: bytes, cuts: list[int]) -> None:
-    whole = FrameDecoder().feed(stream)
+    full = FrameDecoder().feed(stream)
     bounds = [0, *sorted(min(c, len(stream)) for c in cuts), len(stream)]
     decoder = FrameDecoder()
     split: list[Frame] = []
     for a, b in itertools.pairwise(bounds):
         split += decoder.feed(stream[a:b])
-    assert split == whole
+    assert split == full
     one_by_one = FrameDecoder()
-    assert [f for i in range(len(stream)) for f in one_by_one.feed(stream[i : i + 1])] == whole
+    assert [f for i in range(len(stream)) for f in one_by_one.feed(stream[i : i + 1])] == full
 
 
 @given(st.binary(max_size=3000))

@@ -140,12 +140,12 @@ def traced(name: str, values: dict[str, float], poses: FloatArray, seconds: floa
     """The poses before a link effect, block after block."""
     effect, physics = catalogue()[name], Physics.of(load_rig())
     assert effect.trace_back is not None
-    whole = {**effect.off_values(physics, next(effect.variants())), **values}
+    full = {**effect.off_values(physics, next(effect.variants())), **values}
     remembered: list[float] = []
     out = []
     for pose in poses.tolist():
         block = Traced(pose, [0.0, 0.0, 0.0], seconds, physics)
-        effect.trace_back(block, whole, remembered)
+        effect.trace_back(block, full, remembered)
         out.append(block.pose)
     return np.array(out)
 

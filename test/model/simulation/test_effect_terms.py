@@ -159,7 +159,7 @@ def test_a_spot_at_the_edge_is_integrated(psd: int, profile: int, radius: float)
         return 2.0 * np.sqrt(max(radius**2 - u**2, 0.0)) if profile == 1 else float(np.exp(-2.0 * u**2 / radius**2))
 
     reach = radius if profile == 1 else 4.0 * radius
-    whole = quad(across, -reach, reach)[0]
+    full = quad(across, -reach, reach)[0]
     before = samples_of()
     at = 2 * (psd - 1)
     before.dots[at : at + 2] = np.array(
@@ -174,7 +174,7 @@ def test_a_spot_at_the_edge_is_integrated(psd: int, profile: int, radius: float)
             left = quad(across, low, high)[0]
             moved = quad(lambda u: u * across(u), low, high)[0] / left
             assert after.dots[at + axis, i] == pytest.approx(place + moved, abs=1e-3 * radius)
-            share *= left / whole
+            share *= left / full
         assert after.sums[psd - 1, i] == pytest.approx(before.sums[psd - 1, i] * share, rel=1e-3)
     other = 2 - at
     assert (after.dots[other : other + 2] == before.dots[other : other + 2]).all()

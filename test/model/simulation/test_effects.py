@@ -86,11 +86,11 @@ def test_on_is_on_and_off_is_off(active: ActiveEffect) -> None:
 @pytest.mark.parametrize('active', EVERY)
 def test_in_pieces_bit_for_bit(active: ActiveEffect) -> None:
     rig = rig_from_values(rig_values([active]))
-    whole = RigSimulator(rig, 5).step(HISTORY, WARM)
+    full = RigSimulator(rig, 5).step(HISTORY, WARM)
     pieces = RigSimulator(rig, 5)
     cuts = [0, 1, 2, 3, 10, 299, 301, 640, len(HISTORY)]
     got = [pieces.step(HISTORY[a:b], WARM[a:b]).counts for a, b in itertools.pairwise(cuts)]
-    assert np.array_equal(np.concatenate(got), whole.counts)
+    assert np.array_equal(np.concatenate(got), full.counts)
 
 
 @pytest.mark.parametrize('active', EVERY)

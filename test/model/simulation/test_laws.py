@@ -60,13 +60,13 @@ def active(law: Law) -> list[ActiveEffect]:
 @pytest.mark.parametrize('form', [f for f in FORMS if f != 'jitter'])
 def test_a_law_is_simulated_alike_in_pieces_of_any_size(form: str) -> None:
     law = law_of(form)
-    whole = ForwardModel(RIG, active(law)).run(LOADS, WARM)
+    full = ForwardModel(RIG, active(law)).run(LOADS, WARM)
     nominal = ForwardModel(RIG, []).run(LOADS, WARM)
     pieces, model = [], ForwardModel(RIG, active(law))
     for a, b in ((0, 1), (1, 2), (2, 7), (7, 300), (300, 300), (300, len(LOADS))):
         pieces.append(model.run(LOADS[a:b], WARM[a:b]).volts)
-    np.testing.assert_array_equal(np.concatenate(pieces, axis=1), whole.volts)
-    changed = np.any(whole.volts != nominal.volts, axis=1)
+    np.testing.assert_array_equal(np.concatenate(pieces, axis=1), full.volts)
+    changed = np.any(full.volts != nominal.volts, axis=1)
     assert changed.tolist() == [False] * 4 + [True, False]
 
 

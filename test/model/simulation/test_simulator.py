@@ -27,7 +27,7 @@ from psd_deflection.rig.config import load_rig
 
 def test_any_splitting_gives_the_same_samples_bit_for_bit() -> None:
     history = loads.identification().loads[1500:4200]
-    whole = RigSimulator(load_rig(), seed=3).step(history)
+    full = RigSimulator(load_rig(), seed=3).step(history)
     for sizes in ([1] * 50, [7, 13, 1, 64, 3], [20] * 9):
         pieces = RigSimulator(load_rig(), seed=3)
         got = []
@@ -36,9 +36,9 @@ def test_any_splitting_gives_the_same_samples_bit_for_bit() -> None:
             got.append(pieces.step(history[start : start + size]))
             start += size
         got.append(pieces.step(history[start:]))
-        assert np.array_equal(np.concatenate([g.counts for g in got]), whole.counts)
-        assert np.array_equal(np.concatenate([g.pose for g in got]), whole.pose)
-        assert np.array_equal(np.concatenate([g.dots for g in got]), whole.dots)
+        assert np.array_equal(np.concatenate([g.counts for g in got]), full.counts)
+        assert np.array_equal(np.concatenate([g.pose for g in got]), full.pose)
+        assert np.array_equal(np.concatenate([g.dots for g in got]), full.dots)
 
 
 def test_mode_is_exact_against_an_independent_integrator() -> None:
@@ -229,15 +229,15 @@ def test_a_long_history_is_simulated_in_pieces(monkeypatch: pytest.MonkeyPatch) 
     steps = np.repeat(np.array([[0.0, 0.0, 0.0], [3.0, 1.0, 0.1]]), 30, axis=0)
     warm = np.linspace(20.0, 21.0, len(steps))
     lag = make_active('amplifier_lag', {'time_constant': 1e-3}, 'test')
-    at_once = ActiveEffect(dataclasses.replace(lag.effect, whole=True), lag.values)
+    at_once = ActiveEffect(dataclasses.replace(lag.effect, full=True), lag.values)
     monkeypatch.setattr(simulator, 'PIECE', 14)
     for effects, sizes in (([lag], [12, 12, 12, 12, 12]), ([at_once], [60])):
         model = ForwardModel(load_rig(), effects)
         pieces = list(model.expect_in_pieces(steps, warm, 4))
         assert [at.stop - at.start for at, _ in pieces] == sizes
         assert [at.start for at, _ in pieces] == [sum(sizes[:i]) for i in range(len(sizes))]
-        whole = ForwardModel(load_rig(), effects).expect(steps, warm).volts
-        assert np.array_equal(np.concatenate([volts for _, volts in pieces], axis=1), whole)
+        full = ForwardModel(load_rig(), effects).expect(steps, warm).volts
+        assert np.array_equal(np.concatenate([volts for _, volts in pieces], axis=1), full)
     assert list(ForwardModel(load_rig(), []).expect_in_pieces(steps[:0], None)) == []
 
 

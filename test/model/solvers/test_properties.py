@@ -183,10 +183,10 @@ def test_turning_or_mirroring_the_rig_does_so_to_the_answer(
     if (here.phi == here.omega == 0.0) != (there.phi == there.omega == 0.0):
         # minimum_tilt, on the very edge between a tilt and none: rounding decides which covariance it has.
         return
-    whole = np.eye(3)
-    whole[:2, :2] = matrix
-    whole[2, 2] = np.linalg.det(matrix)
-    want = whole @ np.reshape(here.covariance, (3, 3)) @ whole.T
+    full = np.eye(3)
+    full[:2, :2] = matrix
+    full[2, 2] = np.linalg.det(matrix)
+    want = full @ np.reshape(here.covariance, (3, 3)) @ full.T
     scale = np.sqrt(np.diag(want))
     np.testing.assert_allclose(
         np.reshape(there.covariance, (3, 3)) / np.outer(scale, scale), want / np.outer(scale, scale), atol=1e-6

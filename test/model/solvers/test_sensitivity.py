@@ -129,9 +129,9 @@ def test_the_base_pair_is_weighted_least_squares_of_its_model(
         five = (want[0], want[1], 0.0, want[2], want[3])
         keep = [0, 1]
         gain = np.vstack((gain[keep], np.zeros(4)))
-        whole = np.zeros((3, 3))
-        whole[:2, :2] = covariance[:2, :2]
-        covariance = whole
+        full = np.zeros((3, 3))
+        full[:2, :2] = covariance[:2, :2]
+        covariance = full
     np.testing.assert_allclose(got[:5], five, rtol=0.0, atol=3e-9)
     np.testing.assert_allclose(got.residual, residual, rtol=0.0, atol=3e-9)
     sd = np.sqrt(np.diag(covariance)) + 1e-12

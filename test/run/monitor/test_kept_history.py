@@ -72,8 +72,8 @@ def test_what_is_kept_at_any_time_is_what_there_was(
             file.save(made.unsaved())
     file.save(made.unsaved())
     kept = file.load(LATER, LATER)
-    whole = made.rings[1].between(0, made.rings[1].newest + 1)
-    assert kept.cells[-len(whole) :].tobytes() == whole.tobytes()
+    full = made.rings[1].between(0, made.rings[1].newest + 1)
+    assert kept.cells[-len(full) :].tobytes() == full.tobytes()
     file.close()
 
 
@@ -89,16 +89,16 @@ def test_two_runs_are_as_one(file_of: Open) -> None:
     second.restore(file.load(LATER, LATER))
     for one in rows[460:]:
         second.add(one)
-    whole = filled(rows)
+    full = filled(rows)
     for points in (2000, 300):
-        got, want = cells(second, 0, points), cells(whole, 0, points)
+        got, want = cells(second, 0, points), cells(full, 0, points)
         assert got.keys() == want.keys()
         for name, values in want.items():
             np.testing.assert_allclose(got[name], values, rtol=1e-12)
     assert [text for _, text in second.marks] == ['[1]', '[2]']
     # The cell under way is replaced, not kept twice.
     file.save(second.unsaved())
-    assert len(file.load(LATER, LATER).cells) == len(whole.rings[1].between(0, whole.rings[1].newest + 1))
+    assert len(file.load(LATER, LATER).cells) == len(full.rings[1].between(0, full.rings[1].newest + 1))
 
 
 def test_only_the_last_week_is_kept(file_of: Open) -> None:

@@ -73,14 +73,14 @@ def test_the_situation_is_the_load_and_the_pose(plain: Budgeted) -> None:
 def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
     head, *rows = plain.cause_rows()
     assert head[5:] == ['ΔX µm', 'ΔY µm', 'θ mdeg', 'ΔX %', 'ΔY %', 'θ %']
-    whole = plain.budget.total().rms
+    full = plain.budget.total().rms
     for row, (cause, line) in zip(rows, plain.budget.lines, strict=True):
         assert row[:4] == [cause.name, cause.row or '-', cause.kind.value, type_of(cause)]
         freedom = cause.freedom(plain.budget.at)
         assert row[4] == ('∞' if freedom == math.inf else str(int(freedom)))
         size = np.sqrt(line.bias**2 + np.diag(line.covariance))
         assert [float(v) for v in row[5:8]] == pytest.approx((size * SCALES).tolist(), abs=6e-4)
-        assert [float(v) for v in row[8:]] == pytest.approx((100.0 * (size / whole) ** 2).tolist(), abs=0.06)
+        assert [float(v) for v in row[8:]] == pytest.approx((100.0 * (size / full) ** 2).tolist(), abs=0.06)
     # A line of dashes below the head, four columns flush left.
     text = plain.lines()
     assert text[2].split() == ' '.join(head).split()

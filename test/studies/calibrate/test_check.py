@@ -99,11 +99,11 @@ def test_what_no_row_reports_is_undetermined_alone_or_as_a_combination() -> None
     pair[[a, b]] = 1.0 / prior.sd[[a, b]]
     information[[a, b], [a, b]] = 0.0
     information += 1e4 * np.outer(pair, pair)
-    whole = cast(
+    full = cast(
         Any,
         SimpleNamespace(covariance=posterior(information, prior, free), information=information, free=free),
     )
-    found = {tuple(sorted(d.parts)): d.parts for d in undetermined(whole, prior)}
+    found = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, prior)}
     assert set(found) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
     one, other = found['psd_1.gain_x', 'psd_2.gain_x'].values()
     assert (abs(one), one + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
@@ -127,6 +127,6 @@ def test_a_clamp_that_gives_way_is_found_beside_a_pose_that_is_an_outlier() -> N
     linear = Linear(np.zeros((n, 4)), np.zeros((n, 4, size)), np.zeros((n, 4, 3)))
     free = np.zeros(size, dtype=bool)
     noise = Noise(np.array([1e-7, 1e-7, 1e-7]))
-    whole = CalibrationFit(np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free)
-    found = with_clamp(whole, rows, rig, prior)
+    full = CalibrationFit(np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free)
+    found = with_clamp(full, rows, rig, prior)
     assert found.values[CLAMP_AT : CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)

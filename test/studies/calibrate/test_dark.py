@@ -116,11 +116,11 @@ def test_lasers_may_be_off_one_after_the_other_and_for_a_part(nominal: Rig) -> N
 
 def test_lost_samples_are_left_out(nominal: Rig) -> None:
     volts = darkness()
-    whole = dark_levels([run_of(volts)], nominal)
+    full = dark_levels([run_of(volts)], nominal)
     volts[1000:1500] = np.nan
     gaps = dark_levels([run_of(volts)], nominal)
     assert gaps[0].seconds == 4.5
-    assert np.abs(gaps[0].volts - whole[0].volts).max() < 3e-4
+    assert np.abs(gaps[0].volts - full[0].volts).max() < 3e-4
 
 
 @pytest.mark.parametrize(

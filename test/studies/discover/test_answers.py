@@ -234,8 +234,8 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
 
 
 def declared(*parameters: EffectParameter, **given: Any) -> Effect:
-    whole = {'name': 'made_up', 'stage': 'psd', 'point': 'dots', 'apply': lambda *_: None}
-    return Effect(summary='', equation='', source='', needs='', parameters=parameters, **{**whole, **given})
+    full = {'name': 'made_up', 'stage': 'psd', 'point': 'dots', 'apply': lambda *_: None}
+    return Effect(summary='', equation='', source='', needs='', parameters=parameters, **{**full, **given})
 
 
 def listed(effect: Effect, **found: list[float]) -> list[Candidate]:
@@ -503,8 +503,8 @@ def micrometres(value: float) -> str:
 
 
 def left_with(**given: Any) -> Localisation:
-    whole = {'cells': (), 'dependences': (), 'excess': 100.0, 'p': 0.0, 'map': np.zeros((1, 6, 6)), 'spans': ()}
-    return Localisation(**{**whole, **given})
+    full = {'cells': (), 'dependences': (), 'excess': 100.0, 'p': 0.0, 'map': np.zeros((1, 6, 6)), 'spans': ()}
+    return Localisation(**{**full, **given})
 
 
 def test_what_remains_is_reported_in_words() -> None:
@@ -580,7 +580,7 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
 
 
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
-    whole = {
+    full = {
         'sd': {},
         'p': 1e-9,
         'delta_bic': 50.0,
@@ -588,7 +588,7 @@ def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
         'equivalent': (),
         'fitted_alternatives': (),
     }
-    return NamedEffect(active, **{**whole, 'alternatives': (), 'suggestion': None, **given})
+    return NamedEffect(active, **{**full, 'alternatives': (), 'suggestion': None, **given})
 
 
 @pytest.mark.parametrize(

@@ -561,10 +561,10 @@ def test_a_shape_at_its_bound_is_not_the_right_form(observed: tuple[Workspace, F
     assert got.laws[0].terms[0].coefficient == got.fit.effects[-1].values['c1']
     assert got.beside == got.fit.effects[:1]
     bound = Law('b', 'psd', 'y2', (LawTerm('wave', ('x1',), shapes={'period': 1e-3, 'phase': 0.0}),))
-    whole = refit(workspace, [*fit.effects, ActiveEffect(effect_of(bound), values_of(bound))], 0)
+    full = refit(workspace, [*fit.effects, ActiveEffect(effect_of(bound), values_of(bound))], 0)
     with pytest.MonkeyPatch.context() as patch:
         for at, rejected in (((0, 'angle'), False), ((1, 'period1'), True)):
-            stopped = dataclasses.replace(whole, at_bound=(at,))
+            stopped = dataclasses.replace(full, at_bound=(at,))
             patch.setattr(laws, 'refit', lambda *_, stopped=stopped: stopped)
             assert math.isinf(seeker.trial([bound], fit.effects, 1).cost) == rejected
 

@@ -130,8 +130,8 @@ def test_fine_blocks_are_parts_of_the_blocks_of_an_estimate(gappy: Workspace) ->
     want = np.where(there, volts, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
     np.testing.assert_allclose(simulated, want.T, atol=1e-12)
     raw = gappy.raw_residual([])
-    whole = o.volts - ForwardModel(RIG, []).expect(o.loads, None).volts.T
-    np.testing.assert_allclose(raw[0], np.nan_to_num(whole), atol=1e-15)
+    full = o.volts - ForwardModel(RIG, []).expect(o.loads, None).volts.T
+    np.testing.assert_allclose(raw[0], np.nan_to_num(full), atol=1e-15)
     assert gappy.simulations == 3
 
 
@@ -363,8 +363,8 @@ def test_a_line_stands_forty_times_above_the_median() -> None:
         tone = np.cos(2 * np.pi * 200.0 * np.arange(n) / n + np.angle(np.fft.rfft(rows * window)[200]))
         own = np.abs(np.fft.rfft(tone * window)[200])
         need = math.sqrt(times * float(np.median(power[4:]))) - math.sqrt(power[200])
-        whole = (rows + need / own * tone)[:, None]
-        found = proposals.spectral_peaks([whole], [np.ones(1)], [1e-3])
+        full = (rows + need / own * tone)[:, None]
+        found = proposals.spectral_peaks([full], [np.ones(1)], [1e-3])
         assert len(found) == observed
 
 
@@ -422,7 +422,7 @@ def test_mistakes_and_beginnings_have_room_enough() -> None:
     (late,) = declared['load_delay'].parameters
     assert (late.minimum, late.maximum, late.scale, late.unit) == (-2.0, 2.0, 1e-3, 's')
     # It looks at later loads too.
-    assert declared['load_delay'].whole
+    assert declared['load_delay'].full
     # Before everything else that a load passes.
     assert (declared['load_delay'].order, declared['load_delay'].finite, declared['load_delay'].point) == (
         -1,

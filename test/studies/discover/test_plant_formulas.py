@@ -79,7 +79,7 @@ def holed(seed: int = 0) -> list[FloatArray]:
     return out
 
 
-def whole(values: Sequence[FloatArray], channel: int) -> FloatArray:
+def full(values: Sequence[FloatArray], channel: int) -> FloatArray:
     """The values of a channel in all cases that are there."""
     row = np.concatenate([v[channel] for v in values])
     return np.asarray(row[np.isfinite(row)])
@@ -97,7 +97,7 @@ def test_a_plant_is_measured_by_its_own_level() -> None:
     assert (ws.size, ws.effective_size(), ws.simulations) == (50, 50.0, 1)
     assert (ws.names, ws.channels, ws.periods) == (('a', 'b', 'c'), ('force', 'turn'), [1.0] * 3)
     assert (ws.base, ws.nuisance, ws.open_level, ws.budget, ws.physics) == ((), (), True, 4000, None)
-    levels = [rms(whole(observed, c)) for c in range(2)]
+    levels = [rms(full(observed, c)) for c in range(2)]
     assert ws.level == pytest.approx(levels)
     vector = ws.whiten(observed)
     want = [np.nan_to_num(rows / np.array(levels)[:, None]).ravel() for rows in observed]
@@ -127,7 +127,7 @@ def test_a_plant_is_measured_by_its_own_level() -> None:
 def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     observed = holed()
     left = [0.5 * rows for rows in observed]
-    forces, turns = whole(observed, 0), whole(observed, 1)
+    forces, turns = full(observed, 0), full(observed, 1)
     ws = PlantComparison(Pictures(observed, {}))
     assert ws.gap_per_channel(left) == pytest.approx([0.5 * rms(forces), 0.5 * rms(turns)])
     assert math.isnan(ws.floor())
@@ -150,7 +150,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     with_lever.levers = (1.0, 0.1)
     ws = PlantComparison(with_lever)
     ws = ws.begun(refit(ws, ()))
-    count = [np.isfinite(whole(observed, k)).sum() for k in (0, 1)]
+    count = [np.isfinite(full(observed, k)).sum() for k in (0, 1)]
     squares = count[0] * rms(forces) ** 2 + count[1] * (0.1 * rms(turns)) ** 2
     assert ws.gap(observed) == pytest.approx(math.sqrt(squares / sum(count)))
     assert ws.gap_per_channel(observed) == pytest.approx([rms(forces), rms(turns)])
@@ -218,10 +218,10 @@ def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
         ws = PlantComparison(Pictures(observed, {}, noise=noise))
         want = 0.0
         for c in range(2):
-            level = max(rms(whole(observed, c)), noise[c] if noise else 0.0)
-            square = (rms(whole(other, c)) / level) ** 2
+            level = max(rms(full(observed, c)), noise[c] if noise else 0.0)
+            square = (rms(full(other, c)) / level) ** 2
             least = (noise[c] / level) ** 2 if noise else 0.0
-            want += len(whole(observed, c)) * (math.log(max(square, least)) + square / max(square, least))
+            want += len(full(observed, c)) * (math.log(max(square, least)) + square / max(square, least))
         assert ws.loss(ws.whiten(other)) == pytest.approx(want)
     assert ws.loss(ws.whiten(other)) != pytest.approx(28 * (math.log(0.16) + 1.0) + 22 * (math.log(6.25) + 1.0))
     # A level below the noise is the noise.
@@ -250,7 +250,7 @@ def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float, stated: 
             if x:
                 square = sum(v * v for v in x) / len(x)
                 level = max(square, float(least[channel]))
-                weight = len(x) * float(ws.independent[channel]) / len(whole(observed, channel))
+                weight = len(x) * float(ws.independent[channel]) / len(full(observed, channel))
                 sides.append(0.5 * weight * (math.log(level) + square / level))
         want[fold] += sides[0] - sides[1] if sides else 0.0
     np.testing.assert_allclose(ws.pieces(ws.whiten(first), ws.whiten(second)), want, rtol=1e-9)
@@ -308,7 +308,7 @@ def test_a_level_is_the_same_within_two_per_cent(scale: float) -> None:
     rng = np.random.default_rng(3)
     shown = [scale * rng.standard_normal((1, 40)) for _ in range(3)]
     smooth = [np.cumsum(rows, axis=1) for rows in shown]
-    size = rms(whole(shown, 0)) / rms(whole(smooth, 0))
+    size = rms(full(shown, 0)) / rms(full(smooth, 0))
     other = [rows - size * s for rows, s in zip(shown, smooth, strict=True)]
     given = {'channels': ('force',), 'units': ('N',), 'period': 0.1}
     for change, again in ((0.019, False), (0.021, True), (-0.019, False), (-0.021, True)):
@@ -331,7 +331,7 @@ def test_what_a_plant_simulates_is_what_the_model_says() -> None:
     # The first level is that beside the nuisance as it is declared.
     assert plant.asked == [{'b': {'size': 2.0}}]
     assert ws.level == pytest.approx(
-        [rms(whole([m - 2.0 * b for m, b in zip(observed, tables(5), strict=True)], c)) for c in range(2)]
+        [rms(full([m - 2.0 * b for m, b in zip(observed, tables(5), strict=True)], c)) for c in range(2)]
     )
     got = ws.simulate([on('a', 3.0), *ws.nuisance])
     for rows, a, b in zip(got, tables(4), tables(5), strict=True):

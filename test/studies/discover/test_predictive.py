@@ -73,8 +73,8 @@ def test_twelve_small_terms_are_predicted_as_by_bic_or_better(seed: int) -> None
     rng = np.random.default_rng(100 + seed)
     sizes = np.zeros(TERMS)
     sizes[rng.permutation(TERMS)[:12]] = rng.uniform(1.5, 3.0, 12) * rng.choice([-1, 1], 12) / np.sqrt(80 * 1.5)
-    whole = Small(sizes, 440, seed)
-    observed, new = whole.cut(slice(0, 40)), whole.cut(slice(40, 440))
+    full = Small(sizes, 440, seed)
+    observed, new = full.cut(slice(0, 40)), full.cut(slice(40, 440))
     found = psd_deflection.discover_in(observed)
 
     def wrong(model: Model) -> float:

@@ -282,8 +282,8 @@ def test_what_an_effect_weighs_is_the_chi_square_that_is_lost_without_it() -> No
     def rss(*names: tuple[str, str]) -> float:
         return float(np.linalg.lstsq(columns(shown, *names), data, rcond=None)[1][0])
 
-    whole = rss(A, B, ('b', 'y'))
-    lost = [rss(B, ('b', 'y')) - whole, rss(A) - whole]
+    full = rss(A, B, ('b', 'y'))
+    lost = [rss(B, ('b', 'y')) - full, rss(A) - full]
     assert result.delta_chi2 == pytest.approx(lost, rel=1e-5)
     assert result.delta_bic == pytest.approx([lost[0] - 4.0, lost[1] - 8.0], rel=1e-5)
     # Sidak: the chance that the best of 50 does as well.

@@ -143,8 +143,8 @@ NEAR = (
 """What might stand in for a mistake of the set-up. The rest of the catalogue takes time and tells nothing more."""
 
 
-def found_in(*observations: Observation, whole: bool = False) -> Discovery:
-    found = discover(observations, RIG, without=() if whole else [n for n in effect_names() if n not in NEAR])
+def found_in(*observations: Observation, full: bool = False) -> Discovery:
+    found = discover(observations, RIG, without=() if full else [n for n in effect_names() if n not in NEAR])
     tree = found.tree()
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
     return found
@@ -153,7 +153,7 @@ def found_in(*observations: Observation, whole: bool = False) -> Discovery:
 @pytest.mark.slow
 def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
-    found = found_in(recorded(link__length=0.585 * 1.02), whole=True)
+    found = found_in(recorded(link__length=0.585 * 1.02), full=True)
     assert (found.verdict, found.effects) == ('nothing_missing', ())
     (mistake,) = found.setup
     assert (mistake.name, mistake.where) == ('link_length', 'link.length')

@@ -150,8 +150,8 @@ def test_sizes_that_channels_share_are_left_out_of_the_likelihood_once() -> None
     def exact(shapes: FloatArray) -> float:
         same = channel[:, None] == channel[None, :]
         noise, size, length = np.exp(shapes)[channel].T
-        whole = same * size[:, None] ** 2 * np.exp(-0.5 * apart['place'] / length[:, None] ** 2) + np.diag(noise**2)
-        return -float(multivariate_normal(cov=across.T @ whole @ across).logpdf(across.T @ values))
+        full = same * size[:, None] ** 2 * np.exp(-0.5 * apart['place'] / length[:, None] ** 2) + np.diag(noise**2)
+        return -float(multivariate_normal(cov=across.T @ full @ across).logpdf(across.T @ values))
 
     first, second = np.log([[0.5, 1.0, 0.7], [0.3, 2.0, 1.5]]), np.log([[0.2, 1.5, 0.4], [0.9, 0.7, 0.9]])
     (one, _), (other, gradient) = (

@@ -110,9 +110,9 @@ def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: 
     """All but a hundredth of what is beyond noise. Beside an effect it is not looked for."""
     shown = {('link_length', 'x'): pictures(A)[A], B: pictures(B, seed=4)[B]}
     shown[B] = across(shown[B], shown['link_length', 'x'])
-    whole = 100_000.0
+    full = 100_000.0
     plant = Plant(
-        shown, without_noise((shown['link_length', 'x'], whole * (1 - left)), (shown[B], whole * left)) + noise()
+        shown, without_noise((shown['link_length', 'x'], full * (1 - left)), (shown[B], full * left)) + noise()
     )
     message: list[str] = []
     search = searching(plant, shown, ['link_length', 'b'], message)
@@ -159,8 +159,8 @@ def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_repo
     names = 'abcdef'
     shown = pictures(*((n, 'x') for n in names))
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
-    whole = ran(searching(plant, shown, names))
-    assert (named(whole.fit), whole.limits) == (list(names), ())
+    full = ran(searching(plant, shown, names))
+    assert (named(full.fit), full.limits) == (list(names), ())
     # The fit of no effect was before the search; after the first effect there is more than one simulation.
     for budget, effects in ((0, 0), (1, 1)):
         monkeypatch.setattr(plant, 'budget', budget)
@@ -199,8 +199,8 @@ def test_an_effect_that_may_stand_in_is_not_added_and_that_is_reported() -> None
     assert limit.limit.startswith('b beside 1 effect explains less than 20% of what remains')
     assert limit.beyond.startswith('1 more term (b) would pass')
     # With it nothing is left that stands in for anything.
-    whole = ran(searching(plant, shown, 'abc'))
-    assert (named(whole.fit), whole.limits) == (['a', 'b', 'c'], ())
+    full = ran(searching(plant, shown, 'abc'))
+    assert (named(full.fit), full.limits) == (['a', 'b', 'c'], ())
 
 
 def test_a_model_of_two_effects_may_cost_twice_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -406,10 +406,10 @@ def amplitudes(*kinds: tuple[str, str, float], same: bool = False, finite: bool 
     effects: list[ActiveEffect] = []
     for i, (name, unit, value) in enumerate(kinds):
         parameter = EffectParameter(name, unit, -9.0, 9.0, 1e-3, '')
-        whole = dataclasses.replace(
+        full = dataclasses.replace(
             active('e', **{name: 0.0}).effect, name=f'e{i}', parameters=(parameter,), finite=finite
         )
-        effects.append(ActiveEffect(whole, {name: value}))
+        effects.append(ActiveEffect(full, {name: value}))
     free = [(i, name) for i, (name, _, _) in enumerate(kinds)]
     if same:
         parameters = tuple(p for a in effects for p in a.effect.parameters)
@@ -497,26 +497,26 @@ def test_an_alternative_that_comes_close_is_refitted_in_full(
 
 
 def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> None:
-    whole = make_observation(warm=None)
-    volts = whole.volts.copy()
+    full = make_observation(warm=None)
+    volts = full.volts.copy()
     volts[60:] = np.nan
-    poor = dataclasses.replace(whole, volts=volts)
-    (one, both) = (movement_sums(o, ()) for o in ([whole], [poor, whole]))
+    poor = dataclasses.replace(full, volts=volts)
+    (one, both) = (movement_sums(o, ()) for o in ([full], [poor, full]))
     assert both.squared == one.squared > 0.0
     np.testing.assert_array_equal(both.cross, one.cross)
     np.testing.assert_array_equal(both.own, one.own)
-    volts[60:80] = whole.volts[60:80]
-    assert movement_sums([dataclasses.replace(whole, volts=volts), whole], ()).squared > one.squared
+    volts[60:80] = full.volts[60:80]
+    assert movement_sums([dataclasses.replace(full, volts=volts), full], ()).squared > one.squared
     # Sums over the blocks of what the dots moved about their mean, m^2.
-    dots = whole.volts[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
+    dots = full.volts[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
     blocks = dots.reshape(60, 20, 4).mean(axis=1)
     assert one.squared == pytest.approx(float(((blocks - blocks.mean(axis=0)) ** 2).sum()))
     noise_of_dots = float(np.mean(RIG.noises[:, :2] ** 2)) * RIG.amplifier.sensitivity**2
     assert one.noise == pytest.approx(noise_of_dots / 20.0)
     # A load moves as much as it does alone, in proportion.
     for k in range(3):
-        only = np.zeros_like(whole.loads)
-        only[:, k] = whole.loads[:, k]
+        only = np.zeros_like(full.loads)
+        only[:, k] = full.loads[:, k]
         moved = ForwardModel(RIG, []).run(only).dots.T.reshape(60, 20, 4).mean(axis=1)
         moved -= moved.mean(axis=0)
         assert one.own[k, k] == pytest.approx(float((moved**2).sum()), rel=1e-2)
@@ -526,7 +526,7 @@ def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> 
     left, sizes = load_sizes(one, Wiring.from_rig(RIG))
     assert sizes == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
     assert left < 1e-3 * one.squared
-    assert noise_energy([whole, whole]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
+    assert noise_energy([full, full]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
 
 
 @pytest.mark.parametrize(('values', 'observed'), [(4, True), (3, False)])

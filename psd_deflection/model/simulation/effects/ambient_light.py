@@ -33,10 +33,10 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 
 def _correct(reading: Reading, values: Values) -> None:
     psd = int(values['psd']) - 1
-    whole, level = reading.sums[psd].copy(), values['level']
-    laser = np.maximum(whole - level, 1e-3 * whole)
+    full, level = reading.sums[psd].copy(), values['level']
+    laser = np.maximum(full - level, 1e-3 * full)
     for row, center in ((2 * psd, values['x']), (2 * psd + 1, values['y'])):
-        reading.dots[row] = (whole * reading.dots[row] - level * center) / laser
+        reading.dots[row] = (full * reading.dots[row] - level * center) / laser
     reading.sums[psd] = laser
 
 

@@ -21,18 +21,18 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
         return
     p = samples.physics
     steps = (values['delay'] - p.phase) / p.period
-    whole = math.ceil(steps)
+    integer = math.ceil(steps)
     if abs(steps - round(steps)) < 1e-9:
-        whole = round(steps)
-        steps = float(whole)
+        integer = round(steps)
+        steps = float(integer)
     psd = int(values['psd']) - 1
     rows = slice(3 * psd, 3 * psd + 3)
-    now = samples.between((whole - steps) * p.period)[rows]
+    now = samples.between((integer - steps) * p.period)[rows]
     if 'before' not in state:
         # At rest until the first sample.
-        state['before'] = np.repeat(samples.between(0.0)[rows, :1], whole, axis=1)
+        state['before'] = np.repeat(samples.between(0.0)[rows, :1], integer, axis=1)
     line = np.concatenate((state['before'], now), axis=1)
-    state['before'] = line[:, line.shape[1] - whole :].copy()
+    state['before'] = line[:, line.shape[1] - integer :].copy()
     samples.volts[rows] = line[:, : now.shape[1]]
 
 

@@ -35,17 +35,17 @@ def fold_steps(
     folds = workspace.folds()[workspace.row_cases()]
     lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-150)
     j = fit.jacobian / lengths
-    whole_f, whole_g = j.T @ j, j.T @ fit.residual
+    full_f, full_g = j.T @ j, j.T @ fit.residual
     # A parameter at its bound stays there: a step knows no bounds.
     free = np.array([name not in fit.at_bound for name in fit.free])
     away = _from_off(workspace, fit) if home else np.zeros(len(lengths))
     for fold in np.unique(folds):
         test = folds == fold
         jt, rt = j[test], fit.residual[test]
-        f = whole_f - jt.T @ jt
+        f = full_f - jt.T @ jt
         f[np.diag_indices_from(f)] += RIDGE
         step = np.zeros(len(lengths))
-        asked = whole_g - jt.T @ rt + RIDGE * away * lengths
+        asked = full_g - jt.T @ rt + RIDGE * away * lengths
         step[free] = np.linalg.lstsq(f[np.ix_(free, free)], asked[free], rcond=1e-9)[0]
         yield test, step / lengths
 

@@ -159,7 +159,7 @@ def mistakes(
             apply=_delay,
             order=-1,
             finite=True,
-            whole=True,
+            full=True,
         )
         out.append(late_loads)
     if recordings > 1:

@@ -120,7 +120,7 @@ def _moved(recording: int, count: int, shift: FloatArray) -> ActiveEffect:
     choices = tuple(range(1, count + 1))
     which = EffectParameter('recording', '', 1, count, 1, '', nominal=1, kind='choice', choices=choices, each=True)
     share = EffectParameter('share', '', 0.0, 1.0, 1.0, '')
-    effect = Effect('moved', 'link', '', '', '', '', (which, share), 'pose', apply=move, order=99, whole=True)
+    effect = Effect('moved', 'link', '', '', '', '', (which, share), 'pose', apply=move, order=99, full=True)
     return ActiveEffect(effect, {'recording': recording + 1, 'share': 1.0})
 
 
