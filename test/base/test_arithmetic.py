@@ -362,6 +362,6 @@ def test_nothing_on_the_way_of_a_block_leaves_the_order_to_the_processor() -> No
 
 
 def test_the_search_sees_what_depends_on_the_processor() -> None:
-    text = 'a @ b; np.einsum(s, a); np.exp(x); x.sum(); math.cos(x); x ** k; x ** 3; by.sum(x, 0); x ** 2; np.sqrt(x)'
+    text = 'a @ b; np.einsum(s, a); np.exp(x); x.sum(); math.cos(x); x ** k; x ** 3; xp.sum(x, 0); x ** 2; np.sqrt(x)'
     words = [what for _, what in processor_dependent(ast.parse(text))]
     assert sorted(words) == sorted(['a @ b', 'np.einsum', 'np.exp', '.sum()', 'math.cos', 'a ** b', 'a ** 3'])
