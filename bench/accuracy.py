@@ -31,8 +31,8 @@ CASES |= {f'{f:g} N on the link': direct(f) for f in (10.0, 30.0, 50.0)}
 def dots(rig: Rig, pose: FloatArray) -> FloatArray:
     """x1 y1 x2 y2 (4,), m, of a flat plate."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    turned = np.array([[c, s], [-s, c]])
-    return np.concatenate([turned @ (np.array(psd.center) - pose[:2]) - psd.center for psd in rig.psds])
+    rotated = np.array([[c, s], [-s, c]])
+    return np.concatenate([rotated @ (np.array(psd.center) - pose[:2]) - psd.center for psd in rig.psds])
 
 
 def bound(rig: Rig, pose: FloatArray) -> FloatArray:

@@ -81,9 +81,9 @@ class Arm:
         message = PoseWithCovarianceStamped()
         message.header.frame_id = 'end_effector_rest'
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
-        place, turned = message.pose.pose.position, message.pose.pose.orientation
+        place, rotated = message.pose.pose.position, message.pose.pose.orientation
         place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
-        turned.x, turned.y, turned.z, turned.w = deflection.quaternion.tolist()
+        rotated.x, rotated.y, rotated.z, rotated.w = deflection.quaternion.tolist()
         message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
         self._deflections.publish(message)
 

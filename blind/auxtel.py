@@ -53,8 +53,8 @@ class AuxTel(Plant):
         with path.open() as stream:
             rows = np.radians(np.loadtxt(stream))
         self.azimuth, self.elevation = rows[:, 0], rows[:, 1]
-        turned = np.mod(rows[:, 2] - rows[:, 0] + np.pi, 2.0 * np.pi) - np.pi
-        self._observed = ARCSECONDS * np.stack([turned * np.cos(self.elevation), rows[:, 3] - self.elevation])
+        rotated = np.mod(rows[:, 2] - rows[:, 0] + np.pi, 2.0 * np.pi) - np.pi
+        self._observed = ARCSECONDS * np.stack([rotated * np.cos(self.elevation), rows[:, 3] - self.elevation])
         self.nuisance = tuple(_term(name) for name in ('IA', 'IE', *known))
         names = [*PHYSICAL, *_harmonics()]
         self.library = tuple(_term(name) for name in names if name not in {*known, *without})

@@ -106,8 +106,8 @@ def measured(turn: float, seed: int) -> tuple[Array, list[float]]:
     loads = np.zeros((n, 3))
     for at, load in zip(times, LOADS_IN_TURN, strict=True):
         loads[round(at * RATE) :] = load
-    turned = {'name': 'sensor_rotation', 'psd': 1, 'angle': turn}
-    volts = Generator(loads, np.full(n, 21.0), 0.585).record([turned], 'white', seed)
+    rotated = {'name': 'sensor_rotation', 'psd': 1, 'angle': turn}
+    volts = Generator(loads, np.full(n, 21.0), 0.585).record([rotated], 'white', seed)
     return np.rint(volts / LSB), times
 
 

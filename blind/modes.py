@@ -55,8 +55,8 @@ def rung(link: Link, rng: np.random.Generator, seconds: float = 10.0, steps: int
         moved = np.ones(len(t))
         for hertz, zeta, share in link.modes:
             w = 2.0 * np.pi * hertz
-            turned = w * np.sqrt(1.0 - zeta**2)
-            ring = np.cos(turned * since) + zeta * w / turned * np.sin(turned * since)
+            w_damped = w * np.sqrt(1.0 - zeta**2)
+            ring = np.cos(w_damped * since) + zeta * w / w_damped * np.sin(w_damped * since)
             moved -= share * np.exp(-zeta * w * since) * ring
         out += size * np.where(t > start, moved, 0.0)
     return out + link.noise * noise(len(t), link.memory, rng)
@@ -75,10 +75,10 @@ def driven(link: Link, rng: np.random.Generator, seconds: float = 60.0, rms: flo
     """Samples (n,), m, of a link that a random force drives; each step is exact for a force held over it."""
     hertz, zeta, _ = link.modes[0]
     w = 2.0 * np.pi * hertz
-    turned, h = w * np.sqrt(1.0 - zeta**2), 1.0 / RATE
-    decay, cos, sin = np.exp(-zeta * w * h), np.cos(turned * h), np.sin(turned * h)
-    a, b = decay * (cos + zeta * w / turned * sin), decay * sin / turned
-    c, d = -(w**2) * b, decay * (cos - zeta * w / turned * sin)
+    w_damped, h = w * np.sqrt(1.0 - zeta**2), 1.0 / RATE
+    decay, cos, sin = np.exp(-zeta * w * h), np.cos(w_damped * h), np.sin(w_damped * h)
+    a, b = decay * (cos + zeta * w / w_damped * sin), decay * sin / w_damped
+    c, d = -(w**2) * b, decay * (cos - zeta * w / w_damped * sin)
     q = v = 0.0
     out = np.empty(int(seconds * RATE))
     for i, force in enumerate(rng.normal(0.0, 1.0, len(out))):

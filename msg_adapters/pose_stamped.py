@@ -49,5 +49,5 @@ def to_poses(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     ``numbers`` (n, 7 or more): the message's float64 in order, that is position and orientation.
     """
-    turned = np.array([angles(dict(zip('xyzw', q, strict=True))) for q in numbers[:, 3:7].tolist()])
-    return np.column_stack([numbers[:, 0], numbers[:, 1], turned[:, 0]]), turned[:, 1:]
+    rotated = np.array([angles(dict(zip('xyzw', q, strict=True))) for q in numbers[:, 3:7].tolist()])
+    return np.column_stack([numbers[:, 0], numbers[:, 1], rotated[:, 0]]), rotated[:, 1:]

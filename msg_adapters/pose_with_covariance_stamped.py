@@ -52,10 +52,10 @@ def from_estimate(e: DeflectionEstimate | TipMotion | ReferenceWithCovariance) -
 def from_end_effector(e: EndEffectorDeflection, frame: str) -> Fields:
     """Fields of a chain's end effector in ``frame``, that of its rigid pose."""
     place = dict(zip('xyz', e.position, strict=True))
-    turned = dict(zip('xyzw', e.quaternion, strict=True))
+    rotated = dict(zip('xyzw', e.quaternion, strict=True))
     return {
         'header': header(e.t_ns, frame),
-        'pose': {'pose': {'position': place, 'orientation': turned}, 'covariance': list(e.covariance)},
+        'pose': {'pose': {'position': place, 'orientation': rotated}, 'covariance': list(e.covariance)},
     }
 
 

@@ -148,9 +148,9 @@ def reports(folder: Path) -> dict[str, Path]:
     """The page of each study, of a small recording."""
     loads = 'steps:0,0,0;20,0,0;0,-20,0;0,0,2;0,0,0:0.6'
     recording = folder / 'rig.csv'
-    turned = ['--true-pose', '--loads', loads, '--effect', 'sensor_rotation,psd=2,angle=0.01']
+    rotated = ['--true-pose', '--loads', loads, '--effect', 'sensor_rotation,psd=2,angle=0.01']
     studies = ('discover', 'identify', 'validate', 'calibrate')
-    commands = [['simulate', '--out', str(recording), *turned]]
+    commands = [['simulate', '--out', str(recording), *rotated]]
     commands += [[study, str(recording), '--out', str(folder / study)] for study in studies]
     commands += [['plot', str(recording), '--out', str(folder / 'plot.html')]]
     for words in commands:

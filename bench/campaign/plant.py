@@ -202,9 +202,9 @@ class Plant:
         message = PoseWithCovarianceStamped()
         for header in (joints.header, message.header):
             header.stamp.sec, header.stamp.nanosec = stamp_s, stamp_ns
-        place, turned = message.pose.pose.position, message.pose.pose.orientation
+        place, rotated = message.pose.pose.position, message.pose.pose.orientation
         place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
-        turned.x, turned.y, turned.z, turned.w = deflection.quaternion.tolist()
+        rotated.x, rotated.y, rotated.z, rotated.w = deflection.quaternion.tolist()
         message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
         if self.notify_joints(joints):
             self._joints.publish(joints)

@@ -39,10 +39,13 @@ class Shaper:
     def residual(self, frequency: FloatArray | float, damping: float) -> FloatArray:
         """Share of a mode's vibration that is left, for each ``frequency``, Hz (Singer and Seering 1990)."""
         w = 2.0 * np.pi * np.atleast_1d(np.asarray(frequency, dtype=np.float64))
-        turned = w * math.sqrt(1.0 - damping**2)
+        w_damped = w * math.sqrt(1.0 - damping**2)
         t, a = np.array(self.times), np.array(self.sizes)
         grown = a * np.exp(damping * np.outer(w, t))
-        cos, sin = (grown * np.cos(np.outer(turned, t))).sum(axis=1), (grown * np.sin(np.outer(turned, t))).sum(axis=1)
+        cos, sin = (
+            (grown * np.cos(np.outer(w_damped, t))).sum(axis=1),
+            (grown * np.sin(np.outer(w_damped, t))).sum(axis=1),
+        )
         out: FloatArray = np.exp(-damping * w * t[-1]) * np.hypot(cos, sin)
         return out
 

@@ -143,8 +143,8 @@ def what_of_text(text: str) -> Layout:
     if separator == ' ':
         stages += ["tr ',' '.'"] * commas + ["awk -v OFS=, '{$1 = $1} 1'"]
     elif separator != ',':
-        turned = _IN_TR.get(separator, separator)
-        stages.append(f"tr '{turned},' ',.'" if commas else f"tr '{turned}' ','")
+        delimiter = _IN_TR.get(separator, separator)
+        stages.append(f"tr '{delimiter},' ',.'" if commas else f"tr '{delimiter}' ','")
     elif commas:
         stages.append(QUOTED_COMMAS)
     if separator != ',':

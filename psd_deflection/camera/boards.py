@@ -19,7 +19,7 @@ import numpy as np
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera import aruco
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
-from psd_deflection.camera.discs.rim_model import turned
+from psd_deflection.camera.discs.rim_model import rotation_matrix
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.refine_corners import LEAST_REACH, refined
@@ -217,7 +217,8 @@ def _fitted(
             step = np.zeros(6)
             step[i] = scale[i]
             ends = [
-                lens.project(points @ (rotation @ turned(s * step[:3])).T + place + s * step[3:]) for s in (1.0, -1.0)
+                lens.project(points @ (rotation @ rotation_matrix(s * step[:3])).T + place + s * step[3:])
+                for s in (1.0, -1.0)
             ]
             columns.append((ends[0] - ends[1]).ravel() / (2 * scale[i]))
         jacobian = np.array(columns).T
@@ -227,7 +228,7 @@ def _fitted(
         step = inverse @ (jacobian.T @ residual.ravel())
         if not np.all(np.isfinite(step)) or np.linalg.norm(step[:3]) > 1.0:
             raise NoPoseError(Status.MISFIT)
-        rotation, place = rotation @ turned(step[:3]), place + step[3:]
+        rotation, place = rotation @ rotation_matrix(step[:3]), place + step[3:]
         if float(np.max(np.abs(jacobian @ step))) < 1e-4:
             break
     if place[2] <= 0.0:

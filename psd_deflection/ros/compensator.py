@@ -261,17 +261,17 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         return True
 
     def _deflection_fault(self, message: Any) -> str:
-        stamp, turned = message.header.stamp, message.pose.pose.orientation
+        stamp, rotated = message.header.stamp, message.pose.pose.orientation
         wanted = self.settings.frame_prefix + END_REST
         return (
             stamp_fault(stamp.sec, stamp.nanosec)
             or frame_fault(message.header.frame_id, wanted)
-            or quaternion_fault([turned.x, turned.y, turned.z, turned.w])
+            or quaternion_fault([rotated.x, rotated.y, rotated.z, rotated.w])
         )
 
     def _observed(self, message: Any) -> None:
-        at, turned = message.pose.pose.position, message.pose.pose.orientation
-        rotation = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w]).as_matrix()
+        at, rotated = message.pose.pose.position, message.pose.pose.orientation
+        rotation = Rotation.from_quat([rotated.x, rotated.y, rotated.z, rotated.w]).as_matrix()
         t_ns = _ns(message.header.stamp)
         deflection = Transform(rotation, np.array([at.x, at.y, at.z]))
         covariance = np.array(message.pose.covariance).reshape(6, 6)

@@ -128,8 +128,8 @@ def test_sums_of_products_are_those_of_numpy(spec: tuple[str, *tuple[tuple[int, 
     want = np.einsum(spec[0], *operands)
     assert FIXED.einsum(spec[0], *operands) == pytest.approx(want, rel=1e-12, abs=1e-12)
     # Whatever the memory looks like.
-    turned = [np.asfortranarray(a) for a in operands]
-    np.testing.assert_array_equal(FIXED.einsum(spec[0], *turned), FIXED.einsum(spec[0], *operands))
+    rotated = [np.asfortranarray(a) for a in operands]
+    np.testing.assert_array_equal(FIXED.einsum(spec[0], *rotated), FIXED.einsum(spec[0], *operands))
 
 
 @pytest.mark.parametrize('shape', [(3,), (), (2, 1500)])

@@ -41,10 +41,10 @@ from psd_deflection.cli.main import main
 sys.exit(main())
 """
 ON_UNIX = pytest.mark.skipif(sys.platform == 'win32', reason='there is no Unix to be without')
-TURNED = ['--effect', 'sensor_rotation,psd=2,angle=0.02']
+ROTATED = ['--effect', 'sensor_rotation,psd=2,angle=0.02']
 PUSHES = 'steps:0,0,0;30,0,0;0,-50,-29;-40,40,20:1'
 STEPS = [
-    ['simulate', '--out', 'bag', '--loads', PUSHES, '--seed', '3', '--reference-noise', '1e-5,5e-4', *TURNED],
+    ['simulate', '--out', 'bag', '--loads', PUSHES, '--seed', '3', '--reference-noise', '1e-5,5e-4', *ROTATED],
     ['info', 'bag'],
     ['replay', 'bag', '--compare'],
     ['replay', str(ROOT / 'bags' / 'clean'), '--compare'],

@@ -50,9 +50,9 @@ def test_the_light_of_a_room_is_taken_off_with_the_sum_of_its_own_psd(psd: int) 
 def test_what_came_last_is_taken_off_first() -> None:
     """A PSD is turned, then its axes mix, then it is scaled: three that do not commute."""
     c, s = np.cos(0.3), np.sin(0.3)
-    turned, mixed, scaled = np.array([[c, s], [-s, c]]), np.array([[1.0, 0.2], [-0.1, 1.0]]), np.diag([1.5, 0.8])
+    rotated, mixed, scaled = np.array([[c, s], [-s, c]]), np.array([[1.0, 0.2], [-0.1, 1.0]]), np.diag([1.5, 0.8])
     true = np.array([1e-3, -0.4e-3])
-    dots = np.array([[*(scaled @ mixed @ turned @ true), 0.0, 0.0]])
+    dots = np.array([[*(scaled @ mixed @ rotated @ true), 0.0, 0.0]])
     of_all = correction(
         {'name': 'sensor_gain', 'psd': 1, 'x': 0.5, 'y': -0.2},
         {'name': 'sensor_rotation', 'psd': 1, 'angle': 0.3},

@@ -143,11 +143,11 @@ def test_by_one_detector_a_zero_counts_along_its_axis_however_the_tip_is_turned(
     """d = l - R(theta) (c + m): to C come s^2 of l, and v g g^T of the twist's variance v, g = -R'(theta) (c + m)."""
     theta = 0.3
     c, s = math.cos(theta), math.sin(theta)
-    turned, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
+    rotated, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
     volts = at_rest(2)
     beams = np.array([[0.0, 0.07], [-0.1, 0.0]])
     for n, beam in enumerate(beams):
-        volts[:, 3 * n : 3 * n + 2] = (turned.T @ (beam - (1e-3, 2e-3)) - beam) / 5e-4
+        volts[:, 3 * n : 3 * n + 2] = (rotated.T @ (beam - (1e-3, 2e-3)) - beam) / 5e-4
     dot = volts[0, 3 * psd : 3 * psd + 2] * 5e-4
     volts[20:, 3 - 3 * psd : 6 - 3 * psd] = 0.0
     name = f'psd_{psd + 1}__zero_{"xy"[axis]}'

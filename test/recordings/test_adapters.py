@@ -616,8 +616,8 @@ def test_a_temperature_goes_with_a_variance_that_says_not_known() -> None:
 
 
 def test_a_rotation_without_tilts_is_about_z() -> None:
-    turned = quaternion(0.3)
-    assert list(turned.values()) == pytest.approx([0.0, 0.0, math.sin(0.15), math.cos(0.15)], abs=1e-15)
+    rotated = quaternion(0.3)
+    assert list(rotated.values()) == pytest.approx([0.0, 0.0, math.sin(0.15), math.cos(0.15)], abs=1e-15)
 
 
 def cloud(step: int, *more: dict[str, object]) -> dict[str, object]:

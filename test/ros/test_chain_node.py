@@ -52,12 +52,12 @@ def test_end_effector_links_joints_zero_and_recording(chain: Program, peer: Any,
     assert begun.success
     assert peer.call(Trigger, '/chain/zero', Trigger.Request()).message.count('psd_2 (') <= 2
 
-    def turned() -> bool:
+    def rotated() -> bool:
         joints.publish(JointState(name=['elbow', 'wrist'], position=[0.25, math.nan]))
         stated = [v.value for m in health for s in m.status for v in s.values if v.key == 'angle elbow']
         return stated[-1:] == ['0.250000']
 
-    peer.until(turned, 'the turned joint in /diagnostics')
+    peer.until(rotated, 'the turned joint in /diagnostics')
     ended = peer.call(SetBool, '/chain/record', SetBool.Request(data=False))
     assert {m.header.frame_id for m in ends} == {'end_effector_rest'}
     assert [m[-1].header.frame_id for m in tips] == ['upper_link_tip_rest', 'fore_link_tip_rest']

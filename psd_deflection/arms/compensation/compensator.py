@@ -229,9 +229,9 @@ class Compensator:
             self._hold(f'the positions of the joints leap by {leap:.3g}')
         # No joint turns round so quickly, but two nodes that tell different positions look like
         # this.
-        turned = np.where(move * self._last_move < 0.0, np.minimum(np.abs(move), np.abs(self._last_move)), 0.0)
-        if turned.max() > settings.follow_error:
-            self._hold(f'the positions of the joints go to and fro by {turned.max():.3g}')
+        reversed_by = np.where(move * self._last_move < 0.0, np.minimum(np.abs(move), np.abs(self._last_move)), 0.0)
+        if reversed_by.max() > settings.follow_error:
+            self._hold(f'the positions of the joints go to and fro by {reversed_by.max():.3g}')
         self._last_move = move
 
     def observe(self, now: float, observed: Observed) -> Command:

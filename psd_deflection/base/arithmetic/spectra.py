@@ -47,7 +47,7 @@ def transform(series: FloatArray) -> npt.NDArray[np.complex128]:
     n, count = series.shape
     pairs = np.zeros((n, count + count % 2))
     pairs[:, :count] = series
-    re, im = _turned(pairs[:, 0::2], pairs[:, 1::2])
+    re, im = _rotated(pairs[:, 0::2], pairs[:, 1::2])
     half = n // 2 + 1
     mirrored = -np.arange(half) % n
     out = np.empty((half, pairs.shape[1]), dtype=np.complex128)
@@ -58,7 +58,7 @@ def transform(series: FloatArray) -> npt.NDArray[np.complex128]:
     return out[:, :count]
 
 
-def _turned(re: FloatArray, im: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _rotated(re: FloatArray, im: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The transform (n, c), as real and imaginary parts, of a complex series (n, c)."""
     n, count = re.shape
     if n == 1:
@@ -66,7 +66,7 @@ def _turned(re: FloatArray, im: FloatArray) -> tuple[FloatArray, FloatArray]:
     factor = next(p for p in range(2, n + 1) if n % p == 0 or p * p > n)
     factor = factor if n % factor == 0 else n
     rest = n // factor
-    of_rest = [part.reshape(rest, factor, count) for part in _turned(*_split(re, im, rest))]
+    of_rest = [part.reshape(rest, factor, count) for part in _rotated(*_split(re, im, rest))]
     cos, sin, own_cos, own_sin = _twiddles(n, factor)
     tr = of_rest[0] * cos - of_rest[1] * sin
     ti = of_rest[0] * sin + of_rest[1] * cos

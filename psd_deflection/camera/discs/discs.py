@@ -13,7 +13,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.discs.find_discs import MIN_RADIUS, Region, find_discs
 from psd_deflection.camera.discs.rim_fit import Fitter
-from psd_deflection.camera.discs.rim_model import PosePrior, turned
+from psd_deflection.camera.discs.rim_model import PosePrior, rotation_matrix
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.target import Drawing, Target
@@ -104,12 +104,12 @@ class Discs(Target):
         else:
             prior = PosePrior(self._rest.rotation, MOTION_TILT_SD, self._rest.keystone)
         if self._plate is None:
-            guesses = [frontal @ turned(sign * self._tilt(regions[1], frontal)) for sign in (1.0, -1.0)]
+            guesses = [frontal @ rotation_matrix(sign * self._tilt(regions[1], frontal)) for sign in (1.0, -1.0)]
         else:
             # The plate as it was, turned in its own plane to where the line of discs is now.
             line = self._plate.T @ frontal[:, 1]
             angle = math.atan2(-line[0], line[1])
-            guesses = [self._plate @ turned(np.array([0.0, 0.0, angle]))]
+            guesses = [self._plate @ rotation_matrix(np.array([0.0, 0.0, angle]))]
         if self._fitter is None:
             self._fitter = Fitter(lens, image.shape, self._centres, self._radius)
         fits, reason = [], NoPoseError(Status.MISFIT)
@@ -147,9 +147,9 @@ class Discs(Target):
 
     def _place(self, rays: FloatArray, rotation: FloatArray) -> FloatArray:
         """Where a target of this rotation has its centres on ``rays`` (3, 2): linear least squares."""
-        turned_points = self._centres @ rotation[:, :2].T
+        rotated_points = self._centres @ rotation[:, :2].T
         # x - u z = u pz - px for each ray (u, v) and point p, and so in y: x and y are eliminated first.
-        right = rays * turned_points[:, 2:] - turned_points[:, :2]
+        right = rays * rotated_points[:, 2:] - rotated_points[:, :2]
         ray, at = rays.sum(axis=0) / len(rays), right.sum(axis=0) / len(rays)
         off = rays - ray
         far = -float((off * (right - at)).sum() / (off * off).sum())

@@ -195,7 +195,7 @@ def moved(shape: Shape, step: FloatArray, light: FloatArray) -> Shape:
         blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
     skews = shape.skew.size
     return Shape(
-        shape.rotation @ turned(step[:3]),
+        shape.rotation @ rotation_matrix(step[:3]),
         shape.place + step[3:6],
         min(max(shape.swell + float(step[6]), 0.7), 1.4),
         blur,
@@ -205,7 +205,7 @@ def moved(shape: Shape, step: FloatArray, light: FloatArray) -> Shape:
     )
 
 
-def turned(v: FloatArray) -> FloatArray:
+def rotation_matrix(v: FloatArray) -> FloatArray:
     """Return the rotation (3, 3) about ``v`` by its length, rad (Rodrigues)."""
     x, y, z = v.tolist()
     angle = math.sqrt(x * x + y * y + z * z)

@@ -349,12 +349,12 @@ def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
     pose = np.array(LinkStatics.from_rig(rig).deflection(*load))
     stagger = np.array([0.05, -0.05])
     # Across the bending direction heights tell nothing of k: the best pair is turned into it.
-    turned = placement.opposite(float(np.hypot(*(best[0] - best[1]))) / 2.0)
+    opposite = placement.opposite(float(np.hypot(*(best[0] - best[1]))) / 2.0)
     rows = [[f'tilts tied, k free, at {-load[1]:g} N', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'k']]
     for name, centers, heights in (
         ('this rig', rig.centers, rig.heights),
         ('this rig, heights +50, -50 mm', rig.centers, rig.heights + stagger),
-        ('opposite along Y, heights +50, -50 mm', turned, stagger),
+        ('opposite along Y, heights +50, -50 mm', opposite, stagger),
     ):
         s = placement.slope_ratio_spread(pose, link.slope_ratio, link.length, centers, heights, sigma)
         dx, dy, theta, ratio = (s * np.array([1e6, 1e6, MDEG, 1.0])).tolist()

@@ -47,9 +47,9 @@ class Oscillator:
         root = math.sqrt(1.0 - xp.square(zeta))
         decay = xp.exp(-zeta * w * seconds)
         c, s = xp.cos(root * w * seconds), xp.sin(root * w * seconds) / root
-        kept, turned = decay * (c + zeta * s), decay * s
+        kept, out_of_phase = decay * (c + zeta * s), decay * s
         out = np.zeros((4, 4))
-        out[:2, :2] = [[kept, turned], [-turned, decay * (c - zeta * s)]]
+        out[:2, :2] = [[kept, out_of_phase], [-out_of_phase, decay * (c - zeta * s)]]
         out[:, 2:] = self.pushed(np.array([seconds]))[0].T
         return out
 

@@ -160,9 +160,9 @@ class ModalFilter:
 
     def set_noise(self, gamma: FloatArray) -> None:
         """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
-        turned = self._xp.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
+        rotated = self._xp.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
         lags = np.arange(self._size)[:, None] - np.arange(self._size)
-        behind = np.where(lags >= 0, turned.transpose(1, 0, 2)[..., np.abs(lags)], turned[..., np.abs(lags)])
+        behind = np.where(lags >= 0, rotated.transpose(1, 0, 2)[..., np.abs(lags)], rotated[..., np.abs(lags)])
         own = behind[range(3), range(3)]
         self._noise = behind[_FIRST, _SECOND]
         rates = self._stated

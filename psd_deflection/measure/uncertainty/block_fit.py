@@ -207,11 +207,11 @@ class BlockFit:
     def set_noise(self, gamma: FloatArray, tones: Sequence[Tone] = ()) -> None:
         """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings, and what vibrates."""
         xp, turn = self._xp, self._combinations.turn
-        turned = xp.einsum('ac,cdl,bd->abl', turn, gamma, turn)
+        rotated = xp.einsum('ac,cdl,bd->abl', turn, gamma, turn)
         # The covariance with an earlier sample is the transposed one with a later.
-        both = np.concatenate((turned.transpose(1, 0, 2)[:, :, :0:-1], turned), axis=2)
+        both = np.concatenate((rotated.transpose(1, 0, 2)[:, :, :0:-1], rotated), axis=2)
         self._between = np.lib.stride_tricks.sliding_window_view(both, self._size, axis=2)[:, :, :, ::-1]
-        own = turned[self._diagonal, self._diagonal]
+        own = rotated[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=self._size > LARGEST)
         self._full = _terms(self._q, self._precision, self._middle, None, xp)
         u = self._full.u

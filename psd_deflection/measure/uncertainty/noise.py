@@ -296,8 +296,8 @@ class StreamNoise:
         ``rough``: of the combinations that move, the readings and the combination that does not, m^2.
         """
         moving, xp, least = self._moving, self._xp, self._least()
-        turned = xp.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure, xp), moving)
-        means = xp.product(turned, self._mean_of) + least / self._size
+        rotated = xp.einsum('ac,cdl,ad->al', moving, _covariance(gamma, sure, xp), moving)
+        means = xp.product(rotated, self._mean_of) + least / self._size
         fixed_mean = float(xp.product(fixed, self._mean_of)) + least / self._size
         fixed_rough = float(rough[-1])
         still = bool((means * fixed_rough <= _MOTION * rough[: len(moving)] * fixed_mean).all())

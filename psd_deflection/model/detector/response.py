@@ -6,7 +6,7 @@ What happens to a dot at (x, y), m from the detector's centre, in this order:
 
 1. The edges of the active area cut the spot (:mod:`psd_deflection.model.detector.clipping`).
 2. Other light pulls the reading to its own centroid (:func:`pulled`).
-3. The axes are turned in their plane (:func:`turned`).
+3. The axes are turned in their plane (:func:`rotated`).
 4. The reading grows with the distance from the centre (:func:`grown`).
 5. Each axis reads a part of the other one (:func:`crossed`).
 6. Each axis has a gain (:func:`scaled`).
@@ -38,12 +38,12 @@ def pulled(place: FloatArray, laser: Size, level: Size, center: float) -> FloatA
     return (laser * place + level * center) / (laser + level)
 
 
-def freed(reading: FloatArray, laser: Size, level: Size, center: float) -> FloatArray:
+def compensated(reading: FloatArray, laser: Size, level: Size, center: float) -> FloatArray:
     """The inverse of :func:`pulled`."""
     return ((laser + level) * reading - level * center) / laser
 
 
-def turned(x: FloatArray, y: FloatArray, c: Size, s: Size) -> Pair:
+def rotated(x: FloatArray, y: FloatArray, c: Size, s: Size) -> Pair:
     """In axes that are turned by the angle with the cosine ``c`` and the sine ``s``; back with ``-s``."""
     return c * x + s * y, c * y - s * x
 
@@ -102,7 +102,7 @@ class DetectorResponse(NamedTuple):
     def reading(self, x: FloatArray, y: FloatArray, xp: Arithmetic = LIBRARY) -> Pair:
         """What the detector reads of a dot at (x, y), m."""
         angle = np.asarray(self.rotation)
-        x, y = turned(x, y, xp.cos_many(angle), xp.sin_many(angle))
+        x, y = rotated(x, y, xp.cos_many(angle), xp.sin_many(angle))
         x, y = grown(x, y, self.nonlinearity)
         x, y = crossed(x, y, self.crosstalk_xy, self.crosstalk_yx)
         return scaled(x, y, self.gain_x, self.gain_y)
@@ -113,7 +113,7 @@ class DetectorResponse(NamedTuple):
         x, y = uncrossed(x, y, self.crosstalk_xy, self.crosstalk_yx)
         x, y = shrunk(x, y, self.nonlinearity, xp)
         angle = np.asarray(self.rotation)
-        return turned(x, y, xp.cos_many(angle), -xp.sin_many(angle))
+        return rotated(x, y, xp.cos_many(angle), -xp.sin_many(angle))
 
     def slopes(self, x: FloatArray, y: FloatArray, xp: Arithmetic = LIBRARY) -> FloatArray:
         """Derivatives (2, 2, ...) of :meth:`reading` by x and y, by central differences."""

@@ -128,7 +128,7 @@ def _psd_by_parameters(
     m0 = np.array(response.place(p[zero][0], p[zero][1], xp))
     beam = p[at] + m0
     place = _points(p, psd, beam, pose, length, xp) - p[at, None]
-    turned = response.slopes(place[0], place[1], xp)
+    rotated = response.slopes(place[0], place[1], xp)
 
     def moved_beam(d: FloatArray) -> FloatArray:
         return _points(p, psd, beam + d, pose, length, xp)
@@ -144,14 +144,14 @@ def _psd_by_parameters(
 
     # How the dot goes with the beam, and its reading with the beam.
     under = np.stack([_difference(moved_beam, 1e-6 * unit) for unit in np.eye(2)], axis=1)
-    read = xp.einsum('ijn,jkn->ikn', turned, under)
-    out[:, at] = read - turned
+    read = xp.einsum('ijn,jkn->ikn', rotated, under)
+    out[:, at] = read - rotated
     out[:, zero] = xp.einsum('ijn,jk->ikn', read, xp.inverse_of(response.slopes(m0[0], m0[1], xp)))
     for i in (*range(first, first + _CENTER), first + _CUBIC):
         away = xp.einsum('ijn,j->in', read, _difference(rest_place, _step(i)))
         out[:, i] = _difference(read_there, _step(i)) + away
     for i in (first + _HEIGHT, _BEAMS + 2 * psd, _BEAMS + 2 * psd + 1, SLOPE):
-        out[:, i] = xp.einsum('ijn,jn->in', turned, _difference(point, _step(i)))
+        out[:, i] = xp.einsum('ijn,jn->in', rotated, _difference(point, _step(i)))
 
 
 def _step(index: int) -> FloatArray:

@@ -102,8 +102,8 @@ def dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, xp: Arith
         own = slice(2 * psd, 2 * psd + 2)
         response = response_of(p, psd)
         x, y = response.place(read[2 * psd], read[2 * psd + 1], xp)
-        turned = response.slopes(x, y, xp).transpose(2, 0, 1)
-        slopes[:, own] = xp.solve(turned, slopes[:, own])
+        rotated = response.slopes(x, y, xp).transpose(2, 0, 1)
+        slopes[:, own] = xp.solve(rotated, slopes[:, own])
     return slopes
 
 

@@ -242,9 +242,9 @@ def _newton(
     steps = 0
     while steps < _MAX_STEPS:
         steps += 1
-        turned = c * c - s * s
-        slope = difference * s * c + mixed * turned + along * s - across * c
-        curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
+        cos_2 = c * c - s * s
+        slope = difference * s * c + mixed * cos_2 + along * s - across * c
+        curvature = difference * cos_2 - 4.0 * mixed * s * c + along * c + across * s
         # The magnitude of the curvature makes every step go downhill.
         step = slope / abs(curvature)
         theta -= step
@@ -267,9 +267,9 @@ def _newton_many(
     for _ in range(_MAX_STEPS):
         c = xp.cos_many(theta)
         s = xp.sin_many(theta)
-        turned = c * c - s * s
-        slope = difference * s * c + mixed * turned + along * s - across * c
-        curvature = difference * turned - 4.0 * mixed * s * c + along * c + across * s
+        cos_2 = c * c - s * s
+        slope = difference * s * c + mixed * cos_2 + along * s - across * c
+        curvature = difference * cos_2 - 4.0 * mixed * s * c + along * c + across * s
         step = np.where(converged, 0.0, slope / np.abs(curvature))
         theta = theta - step
         converged = np.abs(step) < _LAST_STEP

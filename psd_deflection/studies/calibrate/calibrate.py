@@ -426,7 +426,7 @@ _NEEDS = {
 }
 MOTIONS = tuple(dict.fromkeys(_NEEDS.values()))
 """What determines parameters, what is easily done first."""
-TURNED = (
+ROTATED = (
     'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
 )
 
@@ -436,7 +436,7 @@ def needs_of(names: Sequence[str]) -> str:
     kinds = [name.partition('.')[2] for name in names]
     short = [next(k for k in _NEEDS if kind.startswith(k)) for kind in kinds]
     if set(short) == {'rotation', 'crosstalk'}:
-        return TURNED
+        return ROTATED
     return '; '.join(dict.fromkeys(_NEEDS[k] for k in short))
 
 

@@ -137,20 +137,20 @@ def linearised(rows: Rows, z: FloatArray, rig: Rig, kind: Kind) -> Linear:
     p = z[:COUNT]
     slopes = np.zeros((len(rows), 4, SIZE))
     pose = pose_of_readings(rows.dots, rows.variances, p, length)
-    turned = by_pose(p, pose.T, length).transpose(2, 0, 1)
+    rotated = by_pose(p, pose.T, length).transpose(2, 0, 1)
     slopes[:, :, :COUNT] = by_parameters(p, pose.T, length).transpose(2, 0, 1)
     residual = rows.dots - readings(p, pose.T, length).T
     if kind == 'reference':
-        residual -= np.einsum('nij,nj->ni', turned, rows.pose - z[CLOCK] * rows.velocity - pose)
-        slopes[:, :, CLOCK] = -np.einsum('nij,nj->ni', turned, rows.velocity)
+        residual -= np.einsum('nij,nj->ni', rotated, rows.pose - z[CLOCK] * rows.velocity - pose)
+        slopes[:, :, CLOCK] = -np.einsum('nij,nj->ni', rotated, rows.velocity)
     elif kind == 'loads':
-        residual -= np.einsum('nij,nj->ni', turned, rows.loads * compliances(rig, z) - pose)
+        residual -= np.einsum('nij,nj->ni', rotated, rows.loads * compliances(rig, z) - pose)
         fx, fy, tz = rows.loads.T
         flat = np.zeros_like(fx)
         bent = length**2 * np.stack((fx, fy, flat), axis=1)
-        slopes[:, :, CLAMP_AT] = np.einsum('nij,nj->ni', turned, bent)
-        slopes[:, :, CLAMP_AT + 1] = turned[:, :, 2] * tz[:, None]
-    return Linear(residual, slopes, turned)
+        slopes[:, :, CLAMP_AT] = np.einsum('nij,nj->ni', rotated, bent)
+        slopes[:, :, CLAMP_AT + 1] = rotated[:, :, 2] * tz[:, None]
+    return Linear(residual, slopes, rotated)
 
 
 def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, length: float) -> FloatArray:

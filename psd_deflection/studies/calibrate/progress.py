@@ -8,7 +8,7 @@ import math
 from typing import Any, NamedTuple
 
 from psd_deflection.model.misalignment.model import ALL
-from psd_deflection.studies.calibrate.calibrate import MOTIONS, OPEN, TURNED, Calibration, needs_of
+from psd_deflection.studies.calibrate.calibrate import MOTIONS, OPEN, ROTATED, Calibration, needs_of
 from psd_deflection.studies.calibrate.fit import NAMES, REPORTED, UNITS, Kind
 
 WORDS = {p.name: p.words for p in ALL} | {
@@ -85,7 +85,7 @@ def progress_of(calibration: Calibration) -> CalibrationProgress:
     known = {NAMES[i] for i in REPORTED if calibration.fit.free[i] and share_of_prior[i] <= OPEN}
     motions: dict[str, list[str]] = {}
     for direction in calibration.undetermined:
-        if direction.needs != TURNED:
+        if direction.needs != ROTATED:
             # Of a combination those that are not known one by one, else the largest.
             for name in [part for part in direction.parts if part not in known] or [*direction.parts][:1]:
                 motions.setdefault(needs_of([name]), []).append(name)

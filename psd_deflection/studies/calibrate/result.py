@@ -19,7 +19,7 @@ from psd_deflection.model.simulation.catalogue import effects_of_rig, effects_to
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
-from psd_deflection.studies.calibrate.calibrate import TURNED, Calibration
+from psd_deflection.studies.calibrate.calibrate import ROTATED, Calibration
 from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
@@ -64,8 +64,8 @@ class Calibrated(StudyResult):
         statements += [
             f'undetermined: {", ".join(n.names)}; needed: {n.motion}' for n in progress_of(calibration).needs
         ]
-        if any(d.needs == TURNED for d in calibration.undetermined):
-            statements.append(TURNED.partition(': ')[2])
+        if any(d.needs == ROTATED for d in calibration.undetermined):
+            statements.append(ROTATED.partition(': ')[2])
         return statements
 
     def tree(self) -> dict[str, Any]:

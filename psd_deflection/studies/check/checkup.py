@@ -154,10 +154,10 @@ def _wiring_findings(
 
 def _same_to_first_order(file: Wiring, observed: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
     """Return whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
-    turned = tuple(load for p in observed if p.misfit(file)[1] < 0.0 for load in p.loads)
-    total, worst = misfit(file, observed, turned)
+    rotated = tuple(load for p in observed if p.misfit(file)[1] < 0.0 for load in p.loads)
+    total, worst = misfit(file, observed, rotated)
     same = worst <= LIMIT and total <= best.misfit + MARGIN
-    return (f'load_sign of {" ".join(turned)}',) if same else ()
+    return (f'load_sign of {" ".join(rotated)}',) if same else ()
 
 
 def _load_findings(observed: Sequence[PushResponse], wiring: WiringFit) -> list[Finding]:

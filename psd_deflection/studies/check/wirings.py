@@ -174,9 +174,9 @@ def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
     First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.
     """
     loads_of_responses = [response.loads for response in responses]
-    for turned in range(len(loads_of_responses) + 1):
+    for count in range(len(loads_of_responses) + 1):
         fits: list[WiringFit] = []
-        for some in itertools.combinations(loads_of_responses, turned):
+        for some in itertools.combinations(loads_of_responses, count):
             loads = tuple(itertools.chain.from_iterable(some))
             for wiring in WIRINGS:
                 total, worst = misfit(wiring, responses, loads)

@@ -28,7 +28,7 @@ from psd_deflection.studies.discover.setup.redundant import fourth_reading
 from psd_deflection.studies.discover.steps import search, solve, weigh
 from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded
 
-FREED_FROM = 10.0
+FREE_FROM = 10.0
 """A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
 CLOSED = 0.2
 """Free loads are the answer if they and the effects beside them leave less than this share of it."""
@@ -65,13 +65,13 @@ def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):
         # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
-        turned, better = _refitted(ws, fit)
+        next_ws, better = _refitted(ws, fit)
         if fit.effects:
-            turned, better = _refitted(turned, refit(turned, fit.effects, 6))
-        previous_gap, gap = gap, turned.gap(better.difference)
+            next_ws, better = _refitted(next_ws, refit(next_ws, fit.effects, 6))
+        previous_gap, gap = gap, next_ws.gap(better.difference)
         if gap > previous_gap:
             break
-        ws, fit = turned, better
+        ws, fit = next_ws, better
         if gap > SETTLED * previous_gap or gap < AT_FLOOR * ws.floor():
             break
     return ws, fit
@@ -80,13 +80,13 @@ def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
 def _refitted(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     """Return the free loads as ``fit`` asks for, and what it leaves then: never more than before."""
     for _ in range(TURNS):
-        turned = ws.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
-        turned = ws.refitted(fit.difference) if turned is ws else turned
-        residual, difference = turned.residual([*turned.base, *fit.coefficients_with_nuisance])
-        if turned.gap(difference) > ws.gap(fit.difference):
+        next_ws = ws.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
+        next_ws = ws.refitted(fit.difference) if next_ws is ws else next_ws
+        residual, difference = next_ws.residual([*next_ws.base, *fit.coefficients_with_nuisance])
+        if next_ws.gap(difference) > ws.gap(fit.difference):
             # Beside an effect that is far from linear a step may lead away.
             break
-        ws, fit = turned, replace(fit, residual=residual, difference=difference, chi2=turned.loss(residual))
+        ws, fit = next_ws, replace(fit, residual=residual, difference=difference, chi2=next_ws.loss(residual))
     return ws, fit
 
 
@@ -132,30 +132,35 @@ def _searched(problem: Problem) -> Problem:
     machine = rig_of(problem)
     if machine.recorded.fourth is not None and machine.recorded.fourth.acquits and _follows_nothing(problem):
         # No detector is at fault, and nothing that is known: the loads are asked before the search spends on stand-ins.
-        freed = _with_all_loads_free(problem)
-        if freed is not None and freed.comparison.gap(freed.fit.difference) < SIGNIFICANT * freed.comparison.floor():
-            return _as_annotated(problem, freed)
+        with_free = _with_all_loads_free(problem)
+        if (
+            with_free is not None
+            and with_free.comparison.gap(with_free.fit.difference) < SIGNIFICANT * with_free.comparison.floor()
+        ):
+            return _as_annotated(problem, with_free)
     asked = _with_all_loads_free(problem, maybe_rounded=True) if _rounded_beside_effect(problem) else None
     if asked is not None and _rounded(asked):
         return _as_annotated(problem, asked)
     for step in SEARCH:
         problem = step(problem)
-    freed = _with_all_loads_free(problem, had=asked)
+    with_free = _with_all_loads_free(problem, had=asked)
     before = problem.comparison.gap(problem.fit.difference)
-    if freed is not None and freed.comparison.gap(freed.fit.difference) < CLOSED * before:
-        return _as_annotated(problem, freed)
+    if with_free is not None and with_free.comparison.gap(with_free.fit.difference) < CLOSED * before:
+        return _as_annotated(problem, with_free)
     # A detector at fault may move the dots by more than rounded loads move the plate.
-    freed = _with_all_loads_free(problem, maybe_rounded=True) if freed is None and asked is None else None
-    return _as_annotated(problem, freed) if freed is not None and _rounded(freed) else problem
+    with_free = _with_all_loads_free(problem, maybe_rounded=True) if with_free is None and asked is None else None
+    return _as_annotated(problem, with_free) if with_free is not None and _rounded(with_free) else problem
 
 
-def _as_annotated(problem: Problem, freed: Problem) -> Problem:
-    """``freed``; or the search as noted, from the effects that were found beside free loads, if these leave no more."""
-    ws, effects = problem.comparison, freed.fit.effects
+def _as_annotated(problem: Problem, with_free: Problem) -> Problem:
+    """``with_free``; or the search as noted, from the effects that were found beside free loads, if these leave no
+    more.
+    """
+    ws, effects = problem.comparison, with_free.fit.effects
     begun = refit(ws, effects, 12) if effects else problem.null
-    numbers = sum(isinstance(d, LoadDirection) for d in workspace_of(freed.comparison).directions)
-    if begun.chi2 - freed.fit.chi2 > problem.search.penalty * numbers:
-        return freed
+    numbers = sum(isinstance(d, LoadDirection) for d in workspace_of(with_free.comparison).directions)
+    if begun.chi2 - with_free.fit.chi2 > problem.search.penalty * numbers:
+        return with_free
     problem.progress('as noted')
     for step in (partial(search, begun=begun), *SEARCH[1:]):
         problem = step(problem)
@@ -166,7 +171,7 @@ def _follows_nothing(problem: Problem) -> bool:
     """Return whether some effects leave a good part of the gap, to first order: no simulation is made."""
     ws, fit = problem.comparison, problem.fit
     gap = ws.gap(fit.difference)
-    if gap < FREED_FROM * ws.floor():
+    if gap < FREE_FROM * ws.floor():
         return False
     columns = [fit.jacobian[:, j] for j in range(len(fit.free))]
     for _ in range(FOLLOWED):
@@ -175,7 +180,7 @@ def _follows_nothing(problem: Problem) -> bool:
         if best is None:
             break
         columns += problem.search.screen.columns_of(best.candidate)
-    return not columns or _residual_gap(ws, fit, columns) > max(FOLLOWS * gap, FREED_FROM * ws.floor())
+    return not columns or _residual_gap(ws, fit, columns) > max(FOLLOWS * gap, FREE_FROM * ws.floor())
 
 
 def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
@@ -189,7 +194,7 @@ def _rounded_beside_effect(problem: Problem) -> bool:
     """Whether one effect leaves little of the gap beside loads that may be rounded, and much alone, to first order."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     gap = ws.gap(fit.difference)
-    if gap < FREED_FROM * ws.floor():
+    if gap < FREE_FROM * ws.floor():
         return False
     implied = []
     for i, (o, difference) in enumerate(zip(ws.observations, fit.difference, strict=True)):
@@ -235,7 +240,7 @@ def _with_all_loads_free(
     of loads in whole steps whatever other loads would leave. ``had``: this search, if it was made before.
     """
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
-    if ws.gap(problem.fit.difference) < FREED_FROM * ws.floor():
+    if ws.gap(problem.fit.difference) < FREE_FROM * ws.floor():
         return None
     wrong, observations = [], []
     for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
@@ -258,9 +263,9 @@ def _with_all_loads_free(
     problem.progress('what hung instead of what was noted')
     recorded = replace(machine.recorded, observations=tuple(observations), wrong=tuple(wrong))
     recorded = replace(recorded, stated_gap=recorded.stated_gap or problem.gap_before)
-    freed = recordings_ready.with_free(recorded, recordings_ready.beside(ws, observations, recorded.known))
-    recorded = replace(recorded, fourth=fourth_reading(freed, freed.residual(freed.base)[0]))
+    with_free = recordings_ready.with_free(recorded, recordings_ready.beside(ws, observations, recorded.known))
+    recorded = replace(recorded, fourth=fourth_reading(with_free, with_free.residual(with_free.base)[0]))
     with_free_loads = replace(
-        machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=proposals_of(freed)
+        machine, recorded=recorded, workspace=with_free, bank=SignatureBank(), proposals=proposals_of(with_free)
     )
     return solve(with_free_loads, SEARCH, problem.seed, problem.progress, problem.rng)

@@ -89,8 +89,8 @@ def mode_columns(t: FloatArray, modes: Sequence[tuple[float, float]]) -> FloatAr
     for frequency, damping in modes:
         w = 2.0 * np.pi * frequency
         decay = np.exp(-damping * w * t)
-        turned = w * math.sqrt(max(1.0 - damping * damping, 0.0)) * t
-        columns += [decay * np.cos(turned), decay * np.sin(turned)]
+        phase = w * math.sqrt(max(1.0 - damping * damping, 0.0)) * t
+        columns += [decay * np.cos(phase), decay * np.sin(phase)]
     return np.column_stack(columns)
 
 

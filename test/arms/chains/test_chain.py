@@ -70,8 +70,8 @@ class Frame:
         for foot, tip_name, base, length in ends:
             below, above = self._moved(foot), self._moved(tip_name)
             carried = below[:3] + np.cross(below[3:], base.rotation[:, 2] * length)
-            bent, turned = base.rotation.T @ (above[:3] - carried), base.rotation.T @ (above[3:] - below[3:])
-            self.tips.append(np.array([bent[0], bent[1], turned[2]]))
+            bent, rotated = base.rotation.T @ (above[:3] - carried), base.rotation.T @ (above[3:] - below[3:])
+            self.tips.append(np.array([bent[0], bent[1], rotated[2]]))
 
     def _node(self, at: FloatArray) -> str:
         self._count += 1
@@ -160,8 +160,8 @@ def test_the_covariance_holds_what_the_assumption_about_the_load_leaves(slopes: 
         force, others = rng.uniform(-5.0, 5.0, 3), share * rng.uniform(-5.0, 5.0, (3, 3))
         frame = Frame(chain, force, others)
         found = chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips])
-        turned = np.kron(np.eye(2), found.rigid.rotation)
-        deviations = np.sqrt(np.diag(turned @ found.covariance @ turned.T))
+        rotated = np.kron(np.eye(2), found.rigid.rotation)
+        deviations = np.sqrt(np.diag(rotated @ found.covariance @ rotated.T))
         miss = np.abs(in_base(found) - frame.end)
         inside.extend(miss < 1.96 * deviations)
         error.append(np.linalg.norm(miss[:3]))

@@ -45,8 +45,8 @@ def test_the_jacobian_is_the_derivative(tmp_path: Path, base: str) -> None:
     jacobian, at, h = arm.jacobian(q), arm.pose(q), 1e-6
     for n in range(len(q)):
         moved = arm.pose(q + h * np.eye(len(q))[n])
-        turned = moved._replace(rotation=moved.rotation @ at.rotation.T).rotation_vector
-        assert jacobian[:, n] == pytest.approx(np.concatenate([moved.position - at.position, turned]) / h, abs=1e-5)
+        rotated = moved._replace(rotation=moved.rotation @ at.rotation.T).rotation_vector
+        assert jacobian[:, n] == pytest.approx(np.concatenate([moved.position - at.position, rotated]) / h, abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ def test_what_cannot_be_used_is_rejected(base: BaseAcceleration, why: str) -> No
     assert len(known.reported) == 2
 
 
-def turned(seconds: float) -> motion.Run:
+def rotated(seconds: float) -> motion.Run:
     """A joint at the base turns about x to and fro: 4 rad/s^2 from 0.5 s on, -4 from 0.75 s on, and so on."""
     t = np.arange(round(1000 * seconds)) / 1000.0
     begins = np.arange(0.5, seconds, 0.25)
@@ -143,7 +143,7 @@ def turned(seconds: float) -> motion.Run:
 
 @pytest.fixture(scope='module')
 def run() -> motion.Run:
-    return turned(2.0)
+    return rotated(2.0)
 
 
 def through(

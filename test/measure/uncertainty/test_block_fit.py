@@ -113,11 +113,11 @@ class Dense:
 
     def __init__(self, gamma: FloatArray, beams: FloatArray) -> None:
         self.of = combinations_of(PLACES, beams)
-        turned = np.einsum('ac,cdl,bd->abl', self.of.turn, gamma, self.of.turn)
+        rotated = np.einsum('ac,cdl,bd->abl', self.of.turn, gamma, self.of.turn)
         size = gamma.shape[2]
         later = np.subtract.outer(np.arange(size), np.arange(size)).T
-        back = turned.transpose(1, 0, 2)
-        self.spread = np.where(later >= 0, turned[:, :, np.abs(later)], back[:, :, np.abs(later)])
+        back = rotated.transpose(1, 0, 2)
+        self.spread = np.where(later >= 0, rotated[:, :, np.abs(later)], back[:, :, np.abs(later)])
         self.q = basis(size)
         orders = self.q.shape[1]
         powers = np.polynomial.polynomial.polyvander(np.arange(size) - 0.5 * (size - 1), orders - 1)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import psd_deflection
-from psd_deflection.model.detector.response import DetectorResponse, freed, pulled
+from psd_deflection.model.detector.response import DetectorResponse, compensated, pulled
 from psd_deflection.model.simulation.catalogue import effect_names, make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
@@ -124,7 +124,7 @@ def test_beyond_the_fold_the_inverse_is_a_straight_line(k: float) -> None:
 @given(place, st.floats(0.0, 5.0), place)
 def test_light_is_taken_off_again(x: float, level: float, center: float) -> None:
     read = pulled(np.array(x), SUM, level, center)
-    assert freed(read, SUM, level, center) == pytest.approx(x, abs=1e-17)
+    assert compensated(read, SUM, level, center) == pytest.approx(x, abs=1e-17)
 
 
 HOMONYMS = {

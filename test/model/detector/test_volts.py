@@ -142,8 +142,8 @@ def test_other_light_is_taken_off_as_photocurrents_add() -> None:
     levels = {f'psd_{n}.dark': dark[3 * n - 3 : 3 * n].tolist() for n in (1, 2)}
     both = plain.volts_of_electrodes(np.hstack([a + b for a, b in zip(laser, light, strict=True)])).astype(np.float32)
     assert abs(plain.dots(both) - np.hstack(places)).max() > 20e-6
-    freed = VoltsToDots.from_rig(replace_values(rig, levels)).dots(both)
-    np.testing.assert_allclose(freed, np.hstack(places), atol=2e-9)
+    compensated = VoltsToDots.from_rig(replace_values(rig, levels)).dots(both)
+    np.testing.assert_allclose(compensated, np.hstack(places), atol=2e-9)
 
 
 def test_a_rig_without_dark_levels_reads_as_before_and_one_without_laser_stays_finite() -> None:

@@ -337,7 +337,7 @@ def test_a_second_mode_rings_as_its_equation_says(shares: int, phase: float) -> 
     assert not got[2].any()
 
 
-def freed(width: float, axis: int, poses: list[tuple[float, float, float]]) -> FloatArray:
+def without_friction(width: float, axis: int, poses: list[tuple[float, float, float]]) -> FloatArray:
     """The poses with the clamp's friction taken off, block after block."""
     trace_back, p = EFFECTS['clamp_friction'].trace_back, physics()
     assert trace_back is not None
@@ -369,7 +369,7 @@ def test_half_a_loop_further_on_the_way_it_came(axis: int, rows: tuple[bool, ...
 
         def added(poses: list[tuple[float, float, float]], row: int = row, half: float = half) -> list[float]:
             """What the last block had added, in halves of the loop; nothing on another axis."""
-            got = freed(width, axis, poses) - poses
+            got = without_friction(width, axis, poses) - poses
             others = [i for i in range(3) if i != row]
             assert not got[:, others].any()
             return [float(v) for v in (way * got[:, row] / half if half else got[:, row])]

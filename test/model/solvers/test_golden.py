@@ -134,8 +134,8 @@ def test_what_linearising_costs_and_how_it_is_undone(
     theta = np.radians(theta_deg)
     dots = tuple(rays.tip_dots(geometry, (*d, theta, 0.0, 0.0)).tolist())
     c, s = np.cos(theta), np.sin(theta)
-    turned = np.array([[c, s], [-s, c]]) @ d + (1.0 - c) * np.array([-0.050, 0.035])
-    np.testing.assert_allclose(make_solver('ols', geometry).solve(dots, EQUAL)[:3], [*turned, s], atol=1e-13)
+    rotated = np.array([[c, s], [-s, c]]) @ d + (1.0 - c) * np.array([-0.050, 0.035])
+    np.testing.assert_allclose(make_solver('ols', geometry).solve(dots, EQUAL)[:3], [*rotated, s], atol=1e-13)
     for options in ({}, {'weights': 'thesis'}):
         exact = make_solver('wls_exact', geometry, **options).solve(dots, EQUAL)
         np.testing.assert_allclose(exact[:3], [*d, theta], rtol=0.0, atol=1e-13)

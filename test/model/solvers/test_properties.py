@@ -154,7 +154,7 @@ def test_section_5_3_in_numbers(rays: Any) -> None:
         np.testing.assert_allclose([1e3 * dx, 1e3 * dy], want, rtol=0.0, atol=6e-6)
 
 
-def turned(geometry: Geometry, matrix: Any) -> Geometry:
+def rotated(geometry: Geometry, matrix: Any) -> Geometry:
     return Geometry(
         geometry.centers @ matrix.T,
         geometry.zeros @ matrix.T,
@@ -177,7 +177,7 @@ def test_turning_or_mirroring_the_rig_does_so_to_the_answer(
     options = {'angles': 'azimuth'} if method == 'minimum_tilt' else {}
     here = make_solver(method, geometry, **options).solve(tuple(dots.tolist()), ISOTROPIC)
     there_dots = (dots.reshape(-1, 2) @ matrix.T).ravel()
-    there = make_solver(method, turned(geometry, matrix), **options).solve(tuple(there_dots.tolist()), ISOTROPIC)
+    there = make_solver(method, rotated(geometry, matrix), **options).solve(tuple(there_dots.tolist()), ISOTROPIC)
     np.testing.assert_allclose(there[:2], matrix @ here[:2], rtol=0.0, atol=1e-9)
     assert there.theta == pytest.approx(-here.theta if flip else here.theta, abs=1e-9)
     if (here.phi == here.omega == 0.0) != (there.phi == there.omega == 0.0):
@@ -203,7 +203,7 @@ def test_a_half_turn_and_a_mirror_of_the_beams_rig(
     matrix = np.diag([-1.0, 1.0]) if flip else -np.eye(2)
     here = make_solver('beam', geometry).solve(tuple(dots.tolist()), UNEQUAL)
     there_dots = (dots.reshape(-1, 2) @ matrix.T).ravel()
-    there = make_solver('beam', turned(geometry, matrix)).solve(tuple(there_dots.tolist()), UNEQUAL)
+    there = make_solver('beam', rotated(geometry, matrix)).solve(tuple(there_dots.tolist()), UNEQUAL)
     sign = np.linalg.det(matrix)
     close(there[:3], [*(matrix @ here[:2]), sign * here.theta])
     close(there[3:5], (here.phi, -here.omega) if flip else (-here.phi, -here.omega))

@@ -47,11 +47,11 @@ def calibrated(rig: Rig, truth: dict[str, float], pose: FloatArray, seed: int = 
 
 def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: FloatArray) -> None:
     found = calibrated(nominal, only(psd_2__rotation=0.02), pose)
-    turned = found.values[AT['psd_2.rotation']]
+    rotated = found.values[AT['psd_2.rotation']]
     # Half the difference of the crosstalks looks the same, and gets its share.
     skew = found.values[AT['psd_2.crosstalk_xy']] - found.values[AT['psd_2.crosstalk_yx']]
-    assert turned + skew / 2.0 == pytest.approx(0.02, abs=2e-4)
-    assert turned > 0.015
+    assert rotated + skew / 2.0 == pytest.approx(0.02, abs=2e-4)
+    assert rotated > 0.015
 
 
 def test_errors_are_those_that_are_reported(nominal: Rig, pose: FloatArray) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.studies.calibrate.calibrate import OPEN, TURNED
+from psd_deflection.studies.calibrate.calibrate import OPEN, ROTATED
 from psd_deflection.studies.calibrate.fit import REPORTED
 from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress, progress_of
 from psd_deflection.studies.calibrate.result import result
@@ -28,7 +28,7 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
     assert len(along_x.parameters) == len(REPORTED)
     assert along_x.determined < all_round.determined
     for progress in (along_x, all_round):
-        assert TURNED not in [need.motion for need in progress.needs]
+        assert ROTATED not in [need.motion for need in progress.needs]
         for p in progress.parameters:
             assert p.determined == (p.left <= OPEN)
     of_motion = {need.motion: need.names for need in along_x.needs}

@@ -232,8 +232,8 @@ def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> No
         volts[:, first] *= x
         volts[:, first + 1] *= y
     names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
-    turned = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[n] for n in names)])
-    found = checked(turned, loads, rig)
+    rotated = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[n] for n in names)])
+    found = checked(rotated, loads, rig)
     assert found.verdict == WRONG
     assert dict(found.values) == lines_of(turn)
 

@@ -82,11 +82,11 @@ def test_a_channel_is_dead_that_moves_less_than_a_tenth_of_every_push() -> None:
     tenth = replace(push('fx'), channels=np.array([1.0, 3.0, 9.0, 3.0]) * -1e-4)
     assert ('stuck_channel', 'x1') not in of(checked([tenth, push('fy')]))
     # A turn by hand says nothing of it, and without pushes along both axes nobody knows.
-    turned = replace(push('tz'), only_twist=True)
+    rotated = replace(push('tz'), only_twist=True)
     dead = replace(push('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
-    assert of(checked([dead, push('fy'), turned])) == [('stuck_channel', 'x1')]
+    assert of(checked([dead, push('fy'), rotated])) == [('stuck_channel', 'x1')]
     assert ('stuck_channel', 'x1') not in of(checked([dead, push('fy'), push('tz')]))
-    assert ('stuck_channel', 'x1') not in of(checked([dead, turned]))
+    assert ('stuck_channel', 'x1') not in of(checked([dead, rotated]))
 
 
 def test_a_channel_that_is_stuck_is_reported_once_and_no_wiring_then() -> None:
@@ -94,8 +94,8 @@ def test_a_channel_that_is_stuck_is_reported_once_and_no_wiring_then() -> None:
     found = checked([dead, push('fy')], of_levels(stuck=('x1', 'sum2')))
     assert of(found) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
     assert found.verdict == WRONG
-    turned = Wiring(False, (('-x', 'y'), ('x', 'y')))
-    three = [push(load, 9.80665, turned) for load in ('fx', 'fy', 'tz')]
+    rotated = Wiring(False, (('-x', 'y'), ('x', 'y')))
+    three = [push(load, 9.80665, rotated) for load in ('fx', 'fy', 'tz')]
     assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
 
 

@@ -24,7 +24,7 @@ from psd_deflection.studies.check.wirings import (
 )
 
 PLAIN = Wiring()
-TURNED = Wiring(True, (('-y', 'x'), ('x', 'y')))
+ROTATED = Wiring(True, (('-y', 'x'), ('x', 'y')))
 """PSD 1 is on input 2: its x is y2 turned, its y is x2. PSD 2 is on input 1 as it should be."""
 
 
@@ -91,7 +91,7 @@ def test_the_misfit_is_the_share_of_the_square_that_the_pattern_leaves() -> None
     turn = push([3.0, 4.0, 1.0, 0.0], [2.0, 0.0, 0.0, 0.0], only_twist=True)
     assert turn.misfit(PLAIN) == pytest.approx((16.0 / 20.0, 1.0))
     # With the wiring turned the PSDs see x1 = -y2, y1 = x2, x2 = x1, y2 = y1.
-    assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).misfit(TURNED) == pytest.approx((0.0, 1.0), abs=1e-12)
+    assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).misfit(ROTATED) == pytest.approx((0.0, 1.0), abs=1e-12)
 
 
 def test_a_movement_against_the_push_is_not_explained_unless_its_load_is_turned() -> None:
@@ -130,8 +130,8 @@ def test_three_pushes_leave_one_wiring_and_two_leave_several() -> None:
 
 
 def test_each_difference_has_the_line_that_puts_it_right() -> None:
-    right = parameters(TURNED, PLAIN)
-    assert [fix_of(d, TURNED, right) for d in differences(TURNED, PLAIN)] == [
+    right = parameters(ROTATED, PLAIN)
+    assert [fix_of(d, ROTATED, right) for d in differences(ROTATED, PLAIN)] == [
         'psds_exchanged: true',
         'psd_1.axes: [-y, x]',
         'psd_1.axes: [-y, x]',

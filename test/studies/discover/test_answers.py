@@ -343,11 +343,11 @@ def test_lines_come_strongest_first_each_once() -> None:
     assert proposals.spectral_peaks(rows[:1], [scaled], [1e-3])[0] == pytest.approx(33.3, abs=0.01)
     assert proposals.persistent([71.7, 33.3], rows[:1], [np.ones(6)], [1e-3]) == [71.7, 33.3]
     # A line of half the recording, or one that turns its phase halfway, is no hum.
-    faded, turned = rng.standard_normal((4096, 6)), rng.standard_normal((4096, 6))
+    faded, rotated = rng.standard_normal((4096, 6)), rng.standard_normal((4096, 6))
     sine = np.sin(2 * np.pi * 50.0 * t)
     faded[:, 0] += 2.0 * sine * np.repeat([1.0, 1.0, 1.0, 0.3], 1024)
-    turned[:, 0] += 2.0 * sine * np.repeat([1.0, 1.0, 1.0, -1.0], 1024)
-    for rows_of in (faded, turned):
+    rotated[:, 0] += 2.0 * sine * np.repeat([1.0, 1.0, 1.0, -1.0], 1024)
+    for rows_of in (faded, rotated):
         assert proposals.persistent([50.0], [rows_of], [np.ones(6)], [1e-3]) == []
         assert proposals.persistent([50.0], [rows_of[:3072]], [np.ones(6)], [1e-3]) == [50.0]
 
@@ -613,8 +613,8 @@ def test_numbers_of_json_are_finite() -> None:
     active = make_active('damping', {'bending_ratio': 0.03}, 't')
     tree = trees.parameters_of(named_effect(active, sd={'bending_ratio': math.inf}))
     assert tree == {'bending_ratio': {'value': 0.03, 'sd': 1e300, 'unit': ''}}
-    turned = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': 0.1}, 't'))
-    assert trees.parameters_of(turned) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
+    rotated = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': 0.1}, 't'))
+    assert trees.parameters_of(rotated) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
     assert nested({'a.b': (1, 2), 'a.c.d': 'x', 'e': 3}) == {'a': {'b': [1, 2], 'c': {'d': 'x'}}, 'e': 3}
 
 
@@ -743,7 +743,7 @@ def named_as(name: str, **values: float) -> NamedEffect:
 
 
 def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery) -> None:
-    turned, lag = found.effects[0], named_as('amplifier_lag', time_constant=1e-4)
+    rotated, lag = found.effects[0], named_as('amplifier_lag', time_constant=1e-4)
     soft = named_as('bending_stiffness', scale=-0.02)
     right = 'The estimates of the pose are right without; the simulated motion, and with it the wrench, is not.'
     not_corrected = 'An estimate is not corrected for amplifier_lag.'
@@ -755,8 +755,8 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery
     assert description_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
     assert description_of(lag) == not_corrected
     assert description_of(soft, lag) == not_corrected
-    assert description_of(turned, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
-    assert description_of(turned, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
+    assert description_of(rotated, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
+    assert description_of(rotated, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
 
 
 def test_places_are_reported_if_one_in_twenty_by_chance(found: Discovery) -> None:

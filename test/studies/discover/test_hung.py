@@ -36,7 +36,7 @@ from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, annotated_as, read
 NUMBER = np.arange(len(HELD))
 
 
-TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
+ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
 
 
 def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
@@ -45,7 +45,7 @@ def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
 
 @pytest.mark.slow
 def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> None:
-    found = searched(read(HELD, **TURNED), annotated_as(2, (0, -20, 0)))
+    found = searched(read(HELD, **ROTATED), annotated_as(2, (0, -20, 0)))
     assert [(f.name, f.where) for f in found.setup] == [('missing_load', '8.000 s')]
     assert found.setup[0].value == pytest.approx((0.0, -50.0, 0.0), abs=0.2)
     assert 'not noted: from 8.000 s to 12.000 s (0 N, -50 N, 0 N m) hung, not (0 N, -20 N, 0 N m)' in found.setup[0].fix
@@ -69,7 +69,7 @@ def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> N
     odd = LEVELS + np.array(
         [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
     )
-    found = searched(read(np.repeat(odd, DWELL, axis=0), **TURNED), HELD)
+    found = searched(read(np.repeat(odd, DWELL, axis=0), **ROTATED), HELD)
     assert [f.where for f in found.setup] == [f'load {i}' for i in range(1, 7)]
     assert {f.name for f in found.setup} == {'load_value'}
     assert '(38.9 N, -37.6 N, 20 N m) hung' in found.setup[4].fix
@@ -175,9 +175,9 @@ def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
         assert fourth is not None
         assert fourth.acquits
         assert 0.8 * fourth.values < fourth.chi_square < 1.05 * fourth.values
-    turned = prepared(read(HELD, **TURNED), HELD).fourth
-    assert turned is not None
-    assert not turned.acquits
+    rotated = prepared(read(HELD, **ROTATED), HELD).fourth
+    assert rotated is not None
+    assert not rotated.acquits
 
 
 @pytest.mark.slow
@@ -222,7 +222,7 @@ def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> No
 @pytest.mark.slow
 def test_other_frequencies_are_reported_beside_an_effect() -> None:
     true = {'dynamics__bending_frequency': 14.0 * 1.05, 'dynamics__torsion_frequency': 21.0 * 0.97}
-    found = searched(read(HELD, **true, **TURNED), HELD)
+    found = searched(read(HELD, **true, **ROTATED), HELD)
     sizes = {e.name: e.values for e in found.effects}
     assert set(sizes) == {'bending_frequency', 'torsion_frequency', 'sensor_rotation'}
     assert sizes['sensor_rotation']['angle'] == pytest.approx(0.004, abs=2e-5)
@@ -271,7 +271,7 @@ def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
 def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
     annotated = np.vstack((np.zeros((late, 3)), HELD[:-late]))
-    found = searched(read(HELD, **{**TURNED, 'effects__e__angle': angle}), annotated)
+    found = searched(read(HELD, **{**ROTATED, 'effects__e__angle': angle}), annotated)
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(1e-3 * late, abs=1e-5)
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
@@ -452,7 +452,7 @@ def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> No
 @pytest.mark.slow
 def test_two_effects_under_loads_in_whole_steps_are_no_rounded_loads() -> None:
     """One of them moves the plate as a load does. Whether loads were rounded is asked first, at no search's expense."""
-    two = {**TURNED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}
+    two = {**ROTATED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}
     found = searched(read(HELD, **two), HELD)
     assert {e.active.effect.name for e in found.effects} == {'sensor_rotation', 'load_direction'}
     assert (found.verdict, found.setup) == ('effects_found', ())

@@ -383,8 +383,8 @@ def test_a_line_persists_if_its_quarters_are_alike() -> None:
     assert not steady(1, 1, 1, 0.32)
     for angle, there in ((0.78, True), (0.81, False)):
         # Two quarters turned either way: the cosine of the angle is left.
-        turned = complex(math.cos(angle), math.sin(angle))
-        assert steady(turned, turned.conjugate(), turned, turned.conjugate()) == there
+        rotated = complex(math.cos(angle), math.sin(angle))
+        assert steady(rotated, rotated.conjugate(), rotated, rotated.conjugate()) == there
     # A constant is no line, and every recording must have it.
     rows = np.full((4000, 2), 3.0)
     rows[:, 0] += np.sin(2 * np.pi * 50.0 * t)

@@ -55,7 +55,7 @@ def written(path: Path, readings: FloatArray, header: str = 'x1_mm,y1_mm,x2_mm,y
 
 
 SOFT = make_active('bending_stiffness', {'scale': -0.05}, 'test')
-TURNED = make_active('sensor_rotation', {'psd': 2, 'angle': 0.02}, 'test')
+ROTATED = make_active('sensor_rotation', {'psd': 2, 'angle': 0.02}, 'test')
 
 
 def test_a_table_names_what_the_rig_lacks_and_model_yaml_repairs_it(
@@ -83,9 +83,9 @@ def test_tables_of_two_lengths_report_stiffness_from_the_clamp() -> None:
 
 
 def test_estimates_show_a_turned_sensor_and_poses_of_another_device_do_not() -> None:
-    found = discover_in(ReadingsPlant([read([TURNED], 'estimates')], without=['axis_crosstalk']))
+    found = discover_in(ReadingsPlant([read([ROTATED], 'estimates')], without=['axis_crosstalk']))
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
-    assert discover_in(ReadingsPlant([read([TURNED], 'poses')])).verdict == 'nothing_missing'
+    assert discover_in(ReadingsPlant([read([ROTATED], 'poses')])).verdict == 'nothing_missing'
 
 
 def test_one_effect_on_both_psds_is_simulated_for_both() -> None:
@@ -122,9 +122,9 @@ def test_rows_of_one_load_are_left_out_together() -> None:
 
 
 def test_the_rig_files_effects_are_in_the_model() -> None:
-    turned = {f'effects.turned.{k}': v for k, v in (('name', 'sensor_rotation'), ('psd', 2), ('angle', 0.02))}
-    table = read([TURNED])
-    known = Readings(table.name, replace_values(RIG, turned), 'dots', LOADS, table.values)
+    rotated = {f'effects.turned.{k}': v for k, v in (('name', 'sensor_rotation'), ('psd', 2), ('angle', 0.02))}
+    table = read([ROTATED])
+    known = Readings(table.name, replace_values(RIG, rotated), 'dots', LOADS, table.values)
     plant = ReadingsPlant([known])
     assert [a.label for a in plant.known] == ['sensor_rotation (psd 2)']
     (rows,) = plant.simulate_effects([])

@@ -46,7 +46,7 @@ def loaded(o: Observation, *factors: float) -> Observation:
     return dataclasses.replace(o, loads=o.loads * np.array(factors))
 
 
-def turned(*channels: int) -> Callable[[FloatArray], FloatArray]:
+def rotated(*channels: int) -> Callable[[FloatArray], FloatArray]:
     signs = np.ones(6)
     signs[list(channels)] = -1.0
     return lambda volts: volts * signs
@@ -60,8 +60,8 @@ def ordered(*columns: int) -> Callable[[FloatArray], FloatArray]:
     ('mistake', 'named'),
     [
         (lambda o: o, []),
-        (lambda o: changed(o, turned(1)), [('channel_sign', 'y1', -1.0, 'psd_1.axes: [x, -y]')]),
-        (lambda o: changed(o, turned(3)), [('channel_sign', 'x2', -1.0, "psd_2.axes: [-x, 'y']")]),
+        (lambda o: changed(o, rotated(1)), [('channel_sign', 'y1', -1.0, 'psd_1.axes: [x, -y]')]),
+        (lambda o: changed(o, rotated(3)), [('channel_sign', 'x2', -1.0, "psd_2.axes: [-x, 'y']")]),
         (lambda o: changed(o, ordered(1, 0, 2, 3, 4, 5)), [('axis_swap', 'psd_1', None, "psd_1.axes: ['y', x]")]),
         (lambda o: changed(o, ordered(3, 4, 5, 0, 1, 2)), [('psd_swap', 'psd_1 psd_2', None, 'psds_exchanged: true')]),
         (lambda o: loaded(o, 1.0, -1.0, 1.0), [('load_sign', 'fy', -1.0, 'turn the sign of load_fy in the recording')]),
@@ -166,7 +166,7 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
 @pytest.mark.slow
 def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
     o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
-    found = found_in(changed(o, turned(1)))
+    found = found_in(changed(o, rotated(1)))
     assert [f.name for f in found.setup] == ['channel_sign']
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
     assert found.verdict == 'effects_found'

@@ -571,11 +571,11 @@ def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
     # The wiring is right: a unit leaves no more of the movement than another size does.
     assert (unit.name, unit.where) == ('load_unit', 'fx fy')
     assert unit.evidence == pytest.approx(1.0)
-    turned = dataclasses.replace(o, volts=o.volts * [1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-    _, (sign,), _ = correct_wiring([turned], ())
-    m, file = movement_sums([turned], ()), Wiring.from_rig(RIG)
+    rotated = dataclasses.replace(o, volts=o.volts * [1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    _, (sign,), _ = correct_wiring([rotated], ())
+    m, file = movement_sums([rotated], ()), Wiring.from_rig(RIG)
     right = dataclasses.replace(file, axes=(('x', '-y'), file.axes[1]))
-    energy = noise_energy([turned])
+    energy = noise_energy([rotated])
     reported, sizes = load_sizes(m, file)
     # With the file's wiring a load seems to pull the wrong way: then it explains nothing.
     assert (sizes < 0.0).any()

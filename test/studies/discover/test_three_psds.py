@@ -127,8 +127,8 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
         names = [p.name for p in catalogue(psds)['mains_interference'].parameters]
         sizes, phases = ([f'{of}_{c}' for c in channel_names(psds)] for of in ('amplitude', 'phase'))
         assert names == ['frequency', *sizes, *phases]
-        turned = catalogue(psds)['sensor_rotation']
-        assert [v['psd'] for v in turned.variants(psds)] == list(range(1, psds + 1))
+        rotated = catalogue(psds)['sensor_rotation']
+        assert [v['psd'] for v in rotated.variants(psds)] == list(range(1, psds + 1))
     assert [e.name for e in catalogue().values()] == [e.name for e in catalogue(6).values()]
     with pytest.raises(ConfigError, match='amplitude_x3'):
         with_effects(TWO, ['mains_interference,amplitude_x3=0.01'], 'test')
@@ -336,9 +336,9 @@ def test_a_table_of_readings_may_be_of_three_psds(tmp_path: Path) -> None:
         [(0, 0, 0), (0, -5, 0), (0, -10, 0), (0, -30, 0), (0, -10, -5.85), (0, -50, -29.25), (20, 0, 0), (-20, 0, 0)],
         float,
     )
-    turned = make_active('sensor_rotation', {'psd': 3, 'angle': 0.02}, 'test')
+    rotated = make_active('sensor_rotation', {'psd': 3, 'angle': 0.02}, 'test')
     blank = Readings('table', RIG, 'dots', levels, np.zeros((len(levels), 6)))
-    dots = ReadingsPlant([blank]).simulate_effects([turned])[0].T * 1e-3
+    dots = ReadingsPlant([blank]).simulate_effects([rotated])[0].T * 1e-3
     dots += np.random.default_rng(0).normal(0.0, 1e-3, dots.shape)
     header = ','.join(('load_fx,load_fy,load_tz', *(f'{name}_mm' for name in dot_names(3))))
     rows = [','.join(f'{v:.6g}' for v in (*load, *row)) for load, row in zip(levels, dots, strict=True)]

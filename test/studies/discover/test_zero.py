@@ -32,9 +32,9 @@ OFF = np.sqrt(ZERO) * [0.3, -1.1, 1.6, -0.8]
 """An error that such a zero has."""
 
 
-def recorded(*, taken: bool, turned: float = 0.0) -> Observation:
-    """A recording with a zero that is off, ``taken`` in it or not, of a rig with a detector ``turned``, rad."""
-    true = {'effects.e.name': 'sensor_rotation', 'effects.e.psd': 1, 'effects.e.angle': turned} if turned else {}
+def recorded(*, taken: bool, rotated: float = 0.0) -> Observation:
+    """A recording with a zero that is off, ``taken`` in it or not, of a rig with a detector ``rotated``, rad."""
+    true = {'effects.e.name': 'sensor_rotation', 'effects.e.psd': 1, 'effects.e.angle': rotated} if rotated else {}
     volts = RigSimulator(replace_values(RIG, true), 3).step(LOADS).counts * RIG.converter.volts_per_count
     zeros = {f'psd_{i + 1}.zero': OFF[2 * i : 2 * i + 2].tolist() for i in range(2)}
     o = Observation('x', replace_values(RIG, zeros), np.asarray(volts, dtype=np.float64), LOADS)
@@ -61,7 +61,7 @@ def test_the_same_constants_are_reported_if_no_zero_was_taken() -> None:
 
 @pytest.mark.slow
 def test_an_effect_beside_such_a_zero_is_named_alone() -> None:
-    found = discover([recorded(taken=True, turned=0.004)])
+    found = discover([recorded(taken=True, rotated=0.004)])
     assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
     assert found.effects[0].active.values['angle'] == pytest.approx(0.004, abs=4.0 * found.effects[0].sd['angle'])
     assert found.verdict == 'effects_found'

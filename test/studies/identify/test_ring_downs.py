@@ -48,8 +48,8 @@ def ring(
 ) -> FloatArray:
     """From t = 0 on; nothing before."""
     w = 2.0 * math.pi * frequency
-    turned = w * math.sqrt(1.0 - damping**2) * t + phase
-    return np.where(t >= 0.0, size * np.exp(-damping * w * np.maximum(t, 0.0)) * np.cos(turned), 0.0)
+    angle = w * math.sqrt(1.0 - damping**2) * t + phase
+    return np.where(t >= 0.0, size * np.exp(-damping * w * np.maximum(t, 0.0)) * np.cos(angle), 0.0)
 
 
 def times(n: int) -> FloatArray:

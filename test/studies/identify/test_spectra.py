@@ -172,9 +172,9 @@ def test_the_noise_is_fitted_in_24_bands_above_the_loudest_mode(
     length = max(64, round(4.0 * RATE / min(peaks)))
     window = blackmanharris(length, sym=False)
     pieces = np.lib.stride_tricks.sliding_window_view(samples, length)[:: length - length // 2]
-    turned = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 * 2.0 / (RATE * np.sum(window**2))
+    rotated = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 * 2.0 / (RATE * np.sum(window**2))
     # A quarter of the squares of noise lie below -log(0.75) of their mean.
-    p = np.quantile(turned, 0.25, axis=0) / math.log(4.0 / 3.0)
+    p = np.quantile(rotated, 0.25, axis=0) / math.log(4.0 / 3.0)
     f = np.arange(len(p)) * RATE / length
     shapes = [np.ones(len(f)), 1.0 / np.maximum(np.abs(1.0 - np.exp(-2j * np.pi * f / RATE)) ** 2, 1e-9)]
     # A mode of quality 10.

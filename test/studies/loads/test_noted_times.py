@@ -57,7 +57,7 @@ def volts(loads: FloatArray, seed: int = 0, **true: object) -> FloatArray:
 
 
 QUIET = volts(applied())
-TURNED = volts(applied(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
+ROTATED = volts(applied(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
 
 
 def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedLoads | None:
@@ -65,7 +65,7 @@ def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedL
 
 
 @pytest.mark.parametrize(
-    ('late', 'turned'),
+    ('late', 'rotated'),
     [
         (LATE, True),
         *(
@@ -81,8 +81,8 @@ def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedL
         ),
     ],
 )
-def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], turned: bool) -> None:
-    found = corrected(TURNED if turned else QUIET, annotated(late))
+def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], rotated: bool) -> None:
+    found = corrected(ROTATED if rotated else QUIET, annotated(late))
     assert found is not None
     wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
     assert {n.number: n.delay for n in found.notes} == pytest.approx(wrong, abs=0.002)
@@ -97,7 +97,7 @@ def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, 
 )
 def test_right_times_and_one_small_delay_of_all_are_left_as_they_are(loads: FloatArray) -> None:
     assert corrected(QUIET, loads) is None
-    assert corrected(TURNED, loads) is None
+    assert corrected(ROTATED, loads) is None
 
 
 def test_other_natural_frequencies_than_the_rig_file_says_change_no_time() -> None:
@@ -188,7 +188,7 @@ def test_check_and_calibrate_say_the_same() -> None:
 
 @pytest.mark.slow
 def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
-    found = discover([Observation('x', RIG, TURNED, annotated(LATE))])
+    found = discover([Observation('x', RIG, ROTATED, annotated(LATE))])
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
     assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=1e-4)
     assert found.verdict == 'effects_found'

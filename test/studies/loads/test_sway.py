@@ -88,11 +88,13 @@ def test_a_clamp_that_sticks_keeps_the_last_of_a_sway() -> None:
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 6')]
 
 
-TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
+ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
 STICKS = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
 
 
-@pytest.mark.parametrize('true', [{}, TURNED, STICKS, {'dynamics__bending_damping_ratio': 0.01}, {'link__length': 0.6}])
+@pytest.mark.parametrize(
+    'true', [{}, ROTATED, STICKS, {'dynamics__bending_damping_ratio': 0.01}, {'link__length': 0.6}]
+)
 def test_what_no_weight_does_is_no_sway(true: dict[str, object]) -> None:
     assert swaying_loads(RIG, read(HELD, **true), HELD) == []
 

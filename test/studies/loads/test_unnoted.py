@@ -23,7 +23,7 @@ LEVELS = np.array(
 )
 DWELL = 2000
 HELD = np.repeat(LEVELS, DWELL, axis=0)
-TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
+ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
 WORDS = 'nobody noted it: note each change; this time is left out'
 
 
@@ -54,7 +54,7 @@ def test_check_calibrate_and_discover_say_the_same() -> None:
 
 @pytest.mark.slow
 def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
-    found = discover([Observation('x', RIG, read(HELD, **TURNED), STOPPED)])
+    found = discover([Observation('x', RIG, read(HELD, **ROTATED), STOPPED)])
     assert [f.name for f in found.setup] == ['load_coverage']
     assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
     assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=4.0 * found.effects[0].sd['angle'])

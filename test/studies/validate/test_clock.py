@@ -30,8 +30,8 @@ def test_intervals_hold_the_truth() -> None:
 
 def test_scale_turn_and_bias_of_the_reference_do_not_matter() -> None:
     run = simulated(3)
-    turned = run.poses @ np.array([[1.02, 0.03, 0.0], [-0.03, 0.97, 0.0], [0.0, 0.0, 1.1]]) + [1e-3, -2e-3, 0.05]
-    found = clock_offset(motion_of(run), run.stamps, turned, exposure=0.008)
+    rotated = run.poses @ np.array([[1.02, 0.03, 0.0], [-0.03, 0.97, 0.0], [0.0, 0.0, 1.1]]) + [1e-3, -2e-3, 0.05]
+    found = clock_offset(motion_of(run), run.stamps, rotated, exposure=0.008)
     assert abs(found.value - run.offset) < 4.0 * found.sd < 0.4e-3
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from psd_deflection.base.arithmetic import Arithmetic
-from psd_deflection.model.detector.response import turned
+from psd_deflection.model.detector.response import rotated
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
@@ -13,7 +13,7 @@ from psd_deflection.records import FloatArray
 
 def _turn(dots: FloatArray, psd: float, angle: float, xp: Arithmetic) -> None:
     i = 2 * (int(psd) - 1)
-    dots[i], dots[i + 1] = turned(dots[i], dots[i + 1], xp.cos(angle), xp.sin(angle))
+    dots[i], dots[i + 1] = rotated(dots[i], dots[i + 1], xp.cos(angle), xp.sin(angle))
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:

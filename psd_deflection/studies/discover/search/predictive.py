@@ -253,8 +253,8 @@ def averaged(
             total += weight
         if step % 5 == 4:
             slab = _slab(f, g, energy, size, chosen, rng)
-        turned = int(rng.choice(count, p=pull * weight))
-        inside[turned] = not inside[turned]
+        switched = int(rng.choice(count, p=pull * weight))
+        inside[switched] = not inside[switched]
     return sizes / total, weights / total
 
 

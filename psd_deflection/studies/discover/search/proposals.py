@@ -87,8 +87,8 @@ def persistent(
                 steady = False
                 break
             centred = np.where(there[:, None], scaled - scaled[there].mean(axis=0), 0.0)
-            turned = np.exp(-2j * np.pi * f * t)[:, None] * centred
-            quarters = turned.reshape(4, n, -1).mean(axis=1)[persistent_terms] / shares[persistent_terms, None]
+            rotated = np.exp(-2j * np.pi * f * t)[:, None] * centred
+            quarters = rotated.reshape(4, n, -1).mean(axis=1)[persistent_terms] / shares[persistent_terms, None]
             strongest = int(np.argmax(np.abs(quarters).sum(axis=0)))
             q = quarters[:, strongest]
             size = np.abs(q)

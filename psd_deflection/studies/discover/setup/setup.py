@@ -183,8 +183,8 @@ def correct_wiring(
         alternatives = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
         findings, lines = wiring_findings(wiring, file, plain / residual, alternatives)
         crossed = wiring.crossed
-        turned = [k for k in range(3) if sizes[k] < 0.0]
-        loads[turned] = -1.0
+        rotated = [k for k in range(3) if sizes[k] < 0.0]
+        loads[rotated] = -1.0
         findings += [
             Finding(
                 'load_sign',
@@ -194,7 +194,7 @@ def correct_wiring(
                 plain / residual,
                 alternatives,
             )
-            for k in turned
+            for k in rotated
         ]
     if unit_findings(sizes)[0]:
         # kg mm and N cm are 2 % apart, and a large movement is not in proportion to its load.
