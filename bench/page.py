@@ -24,8 +24,8 @@ SMALL = 2.0
 
 
 def cell(f: Figure, unit: str = '') -> str:
-    spread = '' if f.runs == 1 else f' [{f.low:.3g}–{f.high:.3g}]'
-    return f'{f.median:.3g}{spread} {unit}'.rstrip()
+    quartiles = '' if f.runs == 1 else f' [{f.low:.3g}–{f.high:.3g}]'
+    return f'{f.median:.3g}{quartiles} {unit}'.rstrip()
 
 
 def lines_of(row: Row) -> list[str]:

@@ -45,7 +45,7 @@ class Figure:
     bound: float | None = None
 
     @property
-    def spread(self) -> float:
+    def quartile_range(self) -> float:
         """How far the quartiles are apart, as a share of the median; 0 of one run."""
         return (self.high - self.low) / self.median if self.median else 0.0
 
@@ -75,9 +75,9 @@ class Row:
         """met, not met, or that the quartiles of what is compared are too far apart to tell; '' without a bound."""
         if figure.bound is None:
             return ''
-        spread = max(figure.spread, self.figures[0].spread)
-        if spread > STEADY:
-            return f'not judged: quartiles {100 * spread:.0f} % apart, load from outside'
+        quartile_range = max(figure.quartile_range, self.figures[0].quartile_range)
+        if quartile_range > STEADY:
+            return f'not judged: quartiles {100 * quartile_range:.0f} % apart, load from outside'
         return 'met' if self.met(figure) else 'not met'
 
 

@@ -151,8 +151,8 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     lines.append(f'separable within the limits: {len(can)}; settled and right in at most {MOST}: {len(done)}')
     lines.append(f'said to be inseparable: {len(ended)}, rightly: {sum(not r["separable"] for r in ended)}')
     middle = float(np.median(counts)) if counts else 0.0
-    spread = ', '.join(f'{counts.count(k)} with {k}' for k in range(1, MOST + 1))
-    lines.append(f'recordings needed: {spread}; median {middle:g}')
+    counted = ', '.join(f'{counts.count(k)} with {k}' for k in range(1, MOST + 1))
+    lines.append(f'recordings needed: {counted}; median {middle:g}')
     met = bool(can) and len(done) >= WANTED_SHARE * len(can) and middle <= WANTED_MEDIAN
     return '\n'.join(lines), met
 

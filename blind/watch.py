@@ -46,7 +46,7 @@ HOLD_S, HOLDS = 30, 12
 BLOCK, CHUNK = 20, 1000
 FITTED = 1.5
 """A parabola through a block has so many times the noise of its mean, in the middle (sqrt(9/4))."""
-SPREAD = np.zeros((4, 4))
+PROCESS_NOISE = np.zeros((4, 4))
 
 
 class Run(NamedTuple):
@@ -170,7 +170,7 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
             records += [
                 DeflectionEstimate(t_ns, at + i, 'exact', dx, dy, theta, 0.0, 0.0, covariance, 0.0, True),
                 TipLoad(t_ns, dx / compliance[0], dy / compliance[1], theta / compliance[2]),
-                SpotMeans(t_ns, at + i, tuple(four), (5.0, 5.0), SPREAD, BLOCK, 0, BlockStatus.OK, ''),
+                SpotMeans(t_ns, at + i, tuple(four), (5.0, 5.0), PROCESS_NOISE, BLOCK, 0, BlockStatus.OK, ''),
             ]
             before, began = watch.alarms, time.thread_time()
             for record in records:

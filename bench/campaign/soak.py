@@ -124,7 +124,7 @@ class PolledDevice:
         self.port.close()
 
 
-class Spread:
+class RunningDeviation:
     """Mean and standard deviation of whole numbers, ns, of which none is kept."""
 
     def __init__(self) -> None:
@@ -145,11 +145,11 @@ class Spread:
     def std(self) -> float:
         """NaN where there is none."""
         # Whole numbers to the end: the squares of a day would cancel in floating point.
-        spread = self.count * self.squares - self.total**2
-        return math.sqrt(spread) / self.count if self.count else math.nan
+        square = self.count * self.squares - self.total**2
+        return math.sqrt(square) / self.count if self.count else math.nan
 
 
-def evaluated(name: str, lost: int, growth: int, errors: Spread) -> bool:
+def evaluated(name: str, lost: int, growth: int, errors: RunningDeviation) -> bool:
     """Print the verdict of one part."""
     good = lost == 0 and growth < ALLOWED_GROWTH and (not errors.count or errors.std <= ALLOWED_STD_NS)
     print(
@@ -238,7 +238,7 @@ def real_time(minutes: float) -> bool:
         settled = stamps - stamps[0] > SETTLED_S * 10**9
         growth = memory[-1][1] - memory[0][1] if memory else 0
         print(f'{minutes:g} minutes: {len(numbers)} samples recorded, {poses[0]} poses received by a subscriber')
-        errors = Spread()
+        errors = RunningDeviation()
         for error in (stamps - truth)[settled].tolist():
             errors.add(error)
         return evaluated('real time', lost, growth, errors)
@@ -308,7 +308,7 @@ def simulated_time(hours: float) -> bool:
     samples = int(hours * 3600) * 1000
     # The numbers wrap half way; blocks are cut at multiples of 20, and 2^32 is none.
     first = (2**32 - samples // 2) // 20 * 20
-    errors = Spread()
+    errors = RunningDeviation()
     memory: list[int] = []
     blocks = present = 0
     began = time.perf_counter()

@@ -19,7 +19,7 @@ from psd_deflection.records import FloatArray
 KINDS = ('zv', 'mzv', 'zvd', 'ei')
 TOLERATED = 0.05
 """Share of the vibration that EI leaves at the frequency itself, and that a recommended shaper leaves at most."""
-LEAST_SPREAD = 0.05
+LEAST_BAND = 0.05
 """A link with another payload has another frequency: a shaper is to work within so much of it."""
 
 
@@ -102,8 +102,8 @@ def recommended(frequency: float, frequency_sd: float, damping: float) -> Shaper
 
     If none does, the one that leaves least.
     """
-    spread = max(3.0 * frequency_sd, LEAST_SPREAD * frequency)
-    band = np.linspace(max(frequency - spread, 0.1 * frequency), frequency + spread, 41)
+    half_band = max(3.0 * frequency_sd, LEAST_BAND * frequency)
+    band = np.linspace(max(frequency - half_band, 0.1 * frequency), frequency + half_band, 41)
     candidates = sorted((shaper(kind, frequency, damping) for kind in KINDS), key=lambda s: s.duration)
     worst = [float(s.residual(band, damping).max()) for s in candidates]
     for found, left in zip(candidates, worst, strict=True):

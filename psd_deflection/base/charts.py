@@ -44,7 +44,7 @@ CELLS = (600, 200)
 class Series:
     """One curve: ``x`` and ``y`` (k,) in the units of its panel, NaN: no value.
 
-    ``name``: in the legend; curves of one name are switched together. ``spread`` (k,): ± of each value.
+    ``name``: in the legend; curves of one name are switched together. ``half_width`` (k,): ± of each value.
     ``after_gap`` (k,): True where values are missing before a point; over time None: after each step of more than
     ``GAP`` medians.
     """
@@ -54,7 +54,7 @@ class Series:
     y: FloatArray
     colour: Colour
     style: Style = 'line'
-    spread: FloatArray | None = None
+    half_width: FloatArray | None = None
     bold: bool = False
     after_gap: npt.NDArray[np.bool_] | None = None
 
@@ -67,9 +67,9 @@ class Series:
         at = np.flatnonzero(wide) + 1
         if len(at) == 0:
             return self
-        spread = None if self.spread is None else np.insert(self.spread, at, np.nan)
+        half_width = None if self.half_width is None else np.insert(self.half_width, at, np.nan)
         x = np.insert(self.x, at, 0.5 * (self.x[at - 1] + self.x[at]))
-        return replace(self, x=x, y=np.insert(self.y, at, np.nan), spread=spread, after_gap=None)
+        return replace(self, x=x, y=np.insert(self.y, at, np.nan), half_width=half_width, after_gap=None)
 
 
 class Rule(NamedTuple):
@@ -205,7 +205,7 @@ def _reported(series: Series, columns: dict[str, int]) -> dict[str, Any]:
         'bold': series.bold,
         'x': place(series.x),
         'y': place(series.y),
-        'spread': None if series.spread is None else place(series.spread),
+        'spread': None if series.half_width is None else place(series.half_width),
     }
 
 
@@ -271,5 +271,5 @@ def _cells(values: FloatArray, count: int) -> FloatArray:
 
 
 def _of(one: Series, at: npt.NDArray[np.intp]) -> Series:
-    spread = None if one.spread is None else one.spread[at]
-    return replace(one, x=one.x[at], y=one.y[at], spread=spread)
+    half_width = None if one.half_width is None else one.half_width[at]
+    return replace(one, x=one.x[at], y=one.y[at], half_width=half_width)

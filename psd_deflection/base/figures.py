@@ -148,9 +148,9 @@ def _curve(axis: Any, one: Series) -> None:
         'rings': {'ls': 'none', 'marker': 'o', 'ms': 4, 'mfc': 'none'},
     }
     axis.plot(one.x, one.y, color=tone, label=one.name or None, **styles[one.style])
-    if one.spread is None:
+    if one.half_width is None:
         return
     if one.style == 'line':
-        axis.fill_between(one.x, one.y - one.spread, one.y + one.spread, color=tone, alpha=0.2, lw=0)
+        axis.fill_between(one.x, one.y - one.half_width, one.y + one.half_width, color=tone, alpha=0.2, lw=0)
     else:
-        axis.errorbar(one.x, one.y, np.abs(one.spread), fmt='none', ecolor=tone, lw=1)
+        axis.errorbar(one.x, one.y, np.abs(one.half_width), fmt='none', ecolor=tone, lw=1)

@@ -28,7 +28,7 @@ from psd_deflection.camera.target import Drawing, Target
 from psd_deflection.records import FloatArray
 
 LEAST_CORNERS = 8
-LEAST_SPREAD = 0.35
+LEAST_RATIO = 0.35
 """Smallest spread of the corners that are seen, in units of that of the whole board, along its narrower direction."""
 
 WORST_CORNER = 1.5
@@ -73,7 +73,7 @@ class Board(Target):
         # OpenCV's board: origin in the corner, x right, y down as it is seen. Ours: middle, y up.
         self._middle = np.array([wide / 2, high / 2])
         self._mirror = 1.0 if settings.view == 'outside' else -1.0
-        self._spread = np.array([wide, high]) / math.sqrt(12.0)
+        self._even_sd = np.array([wide, high]) / math.sqrt(12.0)
 
     @abc.abstractmethod
     def _needed(self, settings: CameraSettings) -> int:
@@ -178,7 +178,7 @@ class Board(Target):
         if len(at) < LEAST_CORNERS or pixels is None:
             raise NoPoseError(Status.HIDDEN)
         plane = at - self._middle
-        if np.min(plane.std(axis=0) / self._spread) < LEAST_SPREAD:
+        if np.min(plane.std(axis=0) / self._even_sd) < LEAST_RATIO:
             raise NoPoseError(Status.HIDDEN)
         return plane * [self._mirror, -1.0], np.reshape(pixels, (-1, 2)).astype(float)
 

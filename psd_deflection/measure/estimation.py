@@ -25,7 +25,7 @@ from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.consistency import ConsistencyResult, Unexplained, widened
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.model.detector import dot_noise_variances
-from psd_deflection.model.misalignment.spread import ParameterSpread
+from psd_deflection.model.misalignment.parameter_covariance import ParameterCovariance
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
@@ -160,22 +160,24 @@ class Estimation:
         self._optics = OpticsHealth(rig)
         self._one_psd = OnePsd(Geometry.from_rig(rig))
         config = rig.estimator
-        self._spread_from(self.zero_variances)
+        self._set_parameter_covariance(self.zero_variances)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
         self._subset_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}
 
-    def _spread_from(self, zero_variances: tuple[float, ...]) -> None:
+    def _set_parameter_covariance(self, zero_variances: tuple[float, ...]) -> None:
         """Take the uncertainty of the calibration, and of a zero with these variances (2P,) m^2, () if it has none."""
         self.zero_variances = zero_variances
         at_base = self._rig.psds_at_base
-        self.spread = None if at_base else ParameterSpread.from_rig(self._rig, zero_variances, self._effects)
+        self.parameter_covariance = (
+            None if at_base else ParameterCovariance.from_rig(self._rig, zero_variances, self._effects)
+        )
 
     def state_dict(self) -> State:
         """Return the held twist, what the filter's covariance takes from the last estimate, the zero's variances."""
         out: State = {}
         config = self._rig.estimator
-        if self.spread is not None and self.zero_variances:
+        if self.parameter_covariance is not None and self.zero_variances:
             out[ZERO_VARIANCES] = self.zero_variances
         if self.held is not None and config.degraded == 'hold':
             out[HELD] = tuple(self.held)
@@ -186,7 +188,7 @@ class Estimation:
     def load_state_dict(self, values: Mapping[str, Value]) -> None:
         """See :class:`psd_deflection.measure.state.Part`. Raises ValueError for another number of PSDs."""
         if variances := numbers(values, ZERO_VARIANCES, 'a variance of each reading', 2 * len(self._rig.psds)):
-            self._spread_from(variances)
+            self._set_parameter_covariance(variances)
         if held := numbers(values, HELD, 'time, twist and variance', 3):
             self.held = HeldTwist(int(held[0]), held[1], held[2])
         if systematic := numbers(values, SYSTEMATIC, 'a covariance', 9):
@@ -281,7 +283,11 @@ class Estimation:
         solution, failure = self._solution(0, readings)
         if solution is None:
             return SolvedReadings(readings, None, failure)
-        factor = None if self.spread is None else self.spread.factor(solution.dx, solution.dy, solution.theta)
+        factor = (
+            None
+            if self.parameter_covariance is None
+            else self.parameter_covariance.factor(solution.dx, solution.dy, solution.theta)
+        )
         covariance = readings.covariance
         if factor is not None:
             covariance = covariance + self._xp.einsum('ik,jk->ij', factor, factor)
@@ -480,11 +486,11 @@ class Estimation:
         x, y = block.means[2 * psd : 2 * psd + 2]
         vx, vy = variances[2 * psd : 2 * psd + 2]
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
-        if self.spread is not None:
+        if self.parameter_covariance is not None:
             gain = np.zeros((3, 2 * len(self._rig.psds)))
             c, s = xp.cos_sin(theta)
             gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
-            own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta), xp)
+            own = np.array(cov).reshape(3, 3) + _through(gain, self.parameter_covariance.factor(dx, dy, theta), xp)
             cov = tuple(own.ravel().tolist())
         return DeflectionEstimate(
             t_ns=block.t_ns,

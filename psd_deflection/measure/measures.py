@@ -62,17 +62,17 @@ def measured(volts: Sequence[Volts], samples: Sequence[FloatArray]) -> list[Bloc
     means = in_pairs(z) / n
     sums = v[:, :, 2::3].astype(np.float64)
     count = z.shape[2]
-    spread = np.zeros((blocks, count, count))
+    covariance = np.zeros((blocks, count, count))
     if n > 1:
         centred = z - means
-        spread = in_pairs(centred[:, :, :, None] * centred[:, :, None, :]) / (n - 1)
+        covariance = in_pairs(centred[:, :, :, None] * centred[:, :, None, :]) / (n - 1)
     rough = v
     for _ in range(3):
         rough = rough[1:] - rough[:-1]
     level = np.sqrt(in_pairs(rough * rough) / (max(n - 3, 1) * _THIRD_DIFFERENCE))
     columns = (
         map(tuple, means.tolist()),
-        spread,
+        covariance,
         sums.transpose(1, 0, 2),
         map(tuple, (in_pairs(sums) / n).tolist()),
         np.minimum.reduce(v).tolist(),

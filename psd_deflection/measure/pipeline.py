@@ -201,7 +201,7 @@ class Pipeline:
         values: dict[str, float | str | tuple[float, ...]] = dict(
             zip(ZEROS, zip(means[0::2], means[1::2], strict=True), strict=False)
         )
-        if self.estimation.spread is not None:
+        if self.estimation.parameter_covariance is not None:
             scatter = recent.var(axis=0, ddof=1) if len(recent) > 1 else np.zeros(len(means))
             values[ZERO_VARIANCES] = tuple((np.maximum(scatter, noise) / len(recent)).tolist())
         return self.change(values)

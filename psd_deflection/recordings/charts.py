@@ -41,6 +41,8 @@ def estimates_chart(
     along = TimeAxis(FROM_FIRST, marks)
     panels = []
     for i, (symbol, unit, scale, tone) in enumerate(zip(SYMBOLS, SHOWN_UNITS, SHOWN, TONES, strict=True)):
-        spread = None if sd is None else 1.96 * scale * sd[:, i]
-        panels.append(Panel((Series('', t, scale * pose[:, i], tone, spread=spread),), along, f'{symbol} / {unit}'))
+        half_width = None if sd is None else 1.96 * scale * sd[:, i]
+        panels.append(
+            Panel((Series('', t, scale * pose[:, i], tone, half_width=half_width),), along, f'{symbol} / {unit}')
+        )
     return Chart(topic, panels)

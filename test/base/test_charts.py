@@ -49,7 +49,7 @@ def test_the_same_array_is_there_once() -> None:
 
 def test_what_is_declared_reaches_the_page() -> None:
     x = np.array([1.0, 2.0])
-    series = Series('a', x, x, 'red', 'points', spread=x / 10.0, bold=True)
+    series = Series('a', x, x, 'red', 'points', half_width=x / 10.0, bold=True)
     panel = Panel((series,), 'f / Hz', 'y / m', log='x, y', rules=[Rule(1.5, 'here')], y_range=(0.0, 3.0), height=99)
     content = reported(Chart('what it shows', [panel], beside=2))
     assert content['words'] == 'what it shows'

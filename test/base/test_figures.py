@@ -34,8 +34,8 @@ def test_every_curve_is_in_its_panel() -> None:
 
 
 def test_logarithmic_axes_levels_and_spreads() -> None:
-    band = Series('band', X, X, 'green', spread=X / 2.0, bold=True)
-    bars = Series('bars', X, X, 'violet', 'points', spread=X / 2.0)
+    band = Series('band', X, X, 'green', half_width=X / 2.0, bold=True)
+    bars = Series('bars', X, X, 'violet', 'points', half_width=X / 2.0)
     one = Panel((band,), 'f / Hz', 'p', log='x, y', rules=[Rule(2.0, 'limit', across=True)])
     figure = figure_of(Chart('words', (one, Panel((bars,), 'load / N', 'p'), one), beside=2))
     first, second, _, empty = figure.axes

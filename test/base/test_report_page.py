@@ -39,11 +39,13 @@ def page(browser: Page, tmp_path: Path) -> Iterator[Page]:
     """Two plots over one time with two curves each, then a cloud of two values of x, in closed details a spectrum."""
     gap = np.where((X > 40) & (X < 60), np.nan, -X)
     above = Panel((Series('before', X, 2 * X, 'red'), Series('after', X, gap, 'blue', 'points')), 't / s', 'x / µm')
-    spread = Series('after', X, X, 'blue', spread=np.full(101, 5.0))
-    below = Panel((Series('before', X, X**2, 'red'), spread), 't / s', 'y / µm', rules=[Rule(25.0, 'here')])
+    half_width = Series('after', X, X, 'blue', half_width=np.full(101, 5.0))
+    below = Panel((Series('before', X, X**2, 'red'), half_width), 't / s', 'y / µm', rules=[Rule(25.0, 'here')])
     load = np.repeat([0.0, 10.0], 50)
     cloud = Panel((Series('missing', load, np.arange(100.0), 'text', 'points'),), 'load / N', 'x / µm')
-    other = Series('law', np.array([2.5, 7.5]), np.array([-5.0, 5.0]), 'green', 'rings', spread=np.array([1.0, 1.0]))
+    other = Series(
+        'law', np.array([2.5, 7.5]), np.array([-5.0, 5.0]), 'green', 'rings', half_width=np.array([1.0, 1.0])
+    )
     lone = Panel((other,), 'load / N', 'z')
     f = np.geomspace(0.5, 200.0, 50)
     spectrum = Panel((Series('density', f, 1.0 / f, 'violet', bold=True),), 'frequency / Hz', '1/√Hz', log='x, y')

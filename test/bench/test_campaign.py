@@ -147,11 +147,11 @@ def test_many_frames_at_once_are_the_frames_one_by_one() -> None:
 
 def test_a_spread_is_numpy_s() -> None:
     values = [10**15 + n * n for n in range(50)]
-    spread = soak.Spread()
+    running = soak.RunningDeviation()
     for value in values:
-        spread.add(value)
-    assert spread.std == pytest.approx(float(np.std([n * n for n in range(50)])), rel=1e-12)
-    assert spread.mean == pytest.approx(float(np.mean(values)))
+        running.add(value)
+    assert running.std == pytest.approx(float(np.std([n * n for n in range(50)])), rel=1e-12)
+    assert running.mean == pytest.approx(float(np.mean(values)))
 
 
 def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:

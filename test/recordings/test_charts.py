@@ -34,9 +34,9 @@ def test_estimates_are_drawn_with_their_interval() -> None:
     pose = np.array([[1e-6, 2e-6, np.radians(0.003)]])
     sd = np.array([[1e-7, 2e-7, np.radians(0.0001)]])
     panels = estimates_chart(np.array([0.5]), pose, sd, '/link_tip/deflection', ()).panels
-    shown = [(float(s.y[0]), float(s.spread[0])) for p in panels for s in p.series if s.spread is not None]
+    shown = [(float(s.y[0]), float(s.half_width[0])) for p in panels for s in p.series if s.half_width is not None]
     assert np.allclose(shown, [(1.0, 0.196), (2.0, 0.392), (3.0, 0.196)])
-    assert estimates_chart(np.array([0.5]), pose, None, 'a', ()).panels[0].series[0].spread is None
+    assert estimates_chart(np.array([0.5]), pose, None, 'a', ()).panels[0].series[0].half_width is None
 
 
 @pytest.mark.parametrize('part', ['samples', 'estimates'])

@@ -279,28 +279,28 @@ def design_json(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[
             {
                 'name': name,
                 'centers': centers.tolist(),
-                'sd': _spread(centers, sigma)._asdict(),
+                'sd': _deviation(centers, sigma)._asdict(),
             }
             for name, centers in candidates
         ],
     }
 
 
-def _spread(centers: FloatArray, sigma: float) -> placement.Spread:
+def _deviation(centers: FloatArray, sigma: float) -> placement.PoseDeviations:
     """Infinite where both sensors are at one place: they see no twist then, and nothing that it moves."""
     if math.dist(centers[0], centers[1]) > 0.0:
-        return placement.spread_of_pair(centers, sigma)
-    return placement.Spread(math.inf, math.inf, math.inf)
+        return placement.deviations_of_pair(centers, sigma)
+    return placement.PoseDeviations(math.inf, math.inf, math.inf)
 
 
 def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
     """Spreads and condition numbers, and how much the best one gains."""
     head = ['placement', 'c1 mm', 'c2 mm', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'cond (0.1 m rad)', 'cond (m, rad)']
     rows = [head]
-    spreads = []
+    by_choice = []
     for name, centers in candidates:
-        s = _spread(centers, sigma)
-        spreads.append(s)
+        s = _deviation(centers, sigma)
+        by_choice.append(s)
         if not math.isfinite(s.theta):
             rows.append([name, *_places(centers), *['unseen'] * 3, 'inf', 'inf'])
             continue
@@ -309,7 +309,7 @@ def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
         theta = f'{s.theta * MDEG:.3f}'
         deviations = [f'{s.dx * 1e6:.3f}', f'{s.dy * 1e6:.3f}', theta]
         rows.append([name, *_places(centers), *deviations, f'{scaled:.3f}', f'{in_metres:.3f}'])
-    own, best = spreads[0], spreads[-1]
+    own, best = by_choice[0], by_choice[-1]
     gains = [a / b for a, b in zip(own, best, strict=True)]
     return (
         f'Placement, one standard deviation for {sigma * 1e6:.3f} µm on each reading, at rest:\n\n'
@@ -334,7 +334,7 @@ def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
         (f'three on a ring of {radius * 1e3:g} mm, one plane', three, np.zeros(3)),
         (f'the same, heights {", ".join(f"{h * 1e3:+g}" for h in stagger)} mm', three, stagger),
     ):
-        s = placement.pose_spread(TILTED, centers, heights, sigma) * np.array([1e6, 1e6, *[MDEG] * 3])
+        s = placement.pose_deviations(TILTED, centers, heights, sigma) * np.array([1e6, 1e6, *[MDEG] * 3])
         rows.append([name, *(f'{v:.3f}' if math.isfinite(v) else 'unseen' for v in s.tolist())])
     return (
         columns(rows)
@@ -356,7 +356,7 @@ def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
         ('this rig, heights +50, -50 mm', rig.centers, rig.heights + stagger),
         ('opposite along Y, heights +50, -50 mm', opposite, stagger),
     ):
-        s = placement.slope_ratio_spread(pose, link.slope_ratio, link.length, centers, heights, sigma)
+        s = placement.slope_ratio_deviations(pose, link.slope_ratio, link.length, centers, heights, sigma)
         dx, dy, theta, ratio = (s * np.array([1e6, 1e6, MDEG, 1.0])).tolist()
         rows.append([name, f'{dx:.3f}', f'{dy:.3f}', f'{theta:.3f}', f'{ratio:.4f}'])
     return columns(rows)

@@ -66,7 +66,7 @@ class Oscillator:
         out = np.array([[rest, decay * s, one, zero], [w * since - lag, rest, w * since, one]]).transpose(2, 0, 1)
         return np.asarray(np.where(seconds[:, None, None] >= 0.0, out, 0.0))
 
-    def spreads(self, seconds: FloatArray) -> FloatArray:
+    def added_covariance(self, seconds: FloatArray) -> FloatArray:
         """D (n, 2, 4, 4): covariance that Q_u = 1, or Q_r = w^2, adds in ``seconds`` (n,).
 
         It is the integral of the column of Phi times itself, by Gauss-Legendre in pieces of an eighth of a
@@ -112,20 +112,20 @@ class BlockTables:
         self._observed = np.empty((len(modes), size, 4))
         self._random_walk = np.empty((len(modes), 2, size, size))
         self._to_end = np.empty((len(modes), 2, 4, size))
-        self._spread = np.empty((len(modes), 2, 4, 4))
+        self._added_covariance = np.empty((len(modes), 2, 4, 4))
         self.phi = np.stack([mode.step(size * period) for mode in modes])
         for a, mode in enumerate(modes):
             steps = [mode.step(n * period) for n in range(size + 1)]
-            spreads = mode.spreads(period * np.arange(size + 1, dtype=np.float64))
+            added_covariance = mode.added_covariance(period * np.arange(size + 1, dtype=np.float64))
             self._observed[a] = [steps[n + 1][0] for n in range(size)]
-            self._spread[a] = spreads[size]
+            self._added_covariance[a] = added_covariance[size]
             for s in range(size):
                 # Covariance of the state at sample s with itself, carried on to later samples.
                 for t in range(s, size):
                     self._random_walk[a, :, s, t] = self._random_walk[a, :, t, s] = xp.product(
-                        spreads[s + 1][:, :, 0], steps[t - s][0]
+                        added_covariance[s + 1][:, :, 0], steps[t - s][0]
                     )
-                self._to_end[a, :, :, s] = xp.product(spreads[s + 1][:, :, 0], steps[size - 1 - s].T)
+                self._to_end[a, :, :, s] = xp.product(added_covariance[s + 1][:, :, 0], steps[size - 1 - s].T)
 
     def fill(self, noise: FloatArray, rates: FloatArray) -> None:
         """Use this noise and these rates.
@@ -135,7 +135,7 @@ class BlockTables:
         """
         self._covariance = noise[:, None] + self._xp.einsum('akc,acnm->aknm', rates, self._random_walk)
         self._reach = self._xp.einsum('akc,acin->akin', rates, self._to_end)
-        self.added = self._xp.einsum('akc,acij->akij', rates, self._spread)
+        self.added = self._xp.einsum('akc,acij->akij', rates, self._added_covariance)
         self._full = self._of(np.arange(self.size))
 
     def gains(self, slots: IntArray) -> BlockGains:

@@ -117,7 +117,7 @@ class ModalFilter:
         self._tables = BlockTables(self._modes, size, self._period)
         self._ahead = config.filter_ahead
         self._later = np.stack([mode.step(self._ahead) for mode in self._modes])
-        self._later_spread = np.stack([mode.spreads(np.array([self._ahead]))[0] for mode in self._modes])
+        self._later_covariance = np.stack([mode.added_covariance(np.array([self._ahead]))[0] for mode in self._modes])
         self._longest = config.filter_coast
         self._unseen = (
             UnseenLoads(self._modes, size * self._period, self._longest + self._ahead)
@@ -318,8 +318,8 @@ class ModalFilter:
         covariance = self._xp.einsum('akij,aklj->akil', carried, gains.kept) + gains.left
         self._x = self._xp.einsum('ak,aki->ai', weights, found)
         apart = found - self._x[:, None]
-        spread = covariance + apart[..., :, None] * apart[..., None, :]
-        self._p = self._xp.einsum('ak,akij->aij', weights, spread)
+        total = covariance + apart[..., :, None] * apart[..., None, :]
+        self._p = self._xp.einsum('ak,akij->aij', weights, total)
         self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
         mean = self._xp.einsum('ak,akin->ain', weights, gains.smoothed)
         mean += self._xp.einsum('akij,akjn->ain', weights[..., None, None] * carried, gains.pulled)
@@ -373,7 +373,7 @@ class ModalFilter:
         if self.inertia.known and self._ahead > 0.0:
             x = x + self.inertia.forced(self._end_ns(), np.array([self._ahead])).at[:, 0]
         p = self._xp.einsum('aij,ajl,aml->aim', self._later, self._unsure(), self._later)
-        p += self._xp.einsum('ac,acij->aij', self._rate(), self._later_spread)
+        p += self._xp.einsum('ac,acij->aij', self._rate(), self._later_covariance)
         p += self._unforeseen(self.coasted + self._ahead)
         shared = self._xp.einsum('pij,pjl,pml->pim', self._later[_FIRST], self._shared, self._later[_SECOND])
         t_ns = self._t_ns + round(1e9 * (0.5 * (self._size - 1) * self._period + self._ahead))
@@ -386,7 +386,7 @@ class ModalFilter:
     def predicted(self, seconds: FloatArray) -> Predicted:
         """The motion so long (n,) after the last block's last sample."""
         steps = np.stack([[mode.step(s) for s in seconds.tolist()] for mode in self._modes])
-        added = np.stack([mode.spreads(seconds) for mode in self._modes])
+        added = np.stack([mode.added_covariance(seconds) for mode in self._modes])
         x = self._xp.einsum('anij,aj->nai', steps, self._x)
         if self.inertia.known:
             x = x + self.inertia.forced(self._end_ns(), seconds).at.transpose(1, 0, 2)

@@ -51,7 +51,9 @@ class UnseenLoads:
         self._spans = np.array(spans)
         self._seconds = seconds
         self._phi = np.stack([[mode.step(n * seconds) for mode in modes] for n in spans])
-        self._added = np.stack([mode.spreads(seconds * self._spans).diagonal(0, 2, 3) for mode in modes], axis=1)
+        self._added = np.stack(
+            [mode.added_covariance(seconds * self._spans).diagonal(0, 2, 3) for mode in modes], axis=1
+        )
         self._xp = modes[0].xp
         self._kept = self._xp.exp(-seconds / LATELY)
         self.variances = np.zeros((len(modes), len(spans), 4))

@@ -281,7 +281,7 @@ class BlockFit:
         else:
             weights = np.zeros((blocks, count, self._size))
             weights[:, :, slots] = xp.einsum('ask,kza->zas', terms.u, x)
-            covariance = self._spread(weights)
+            covariance = self._covariance_of(weights)
         misfit = [False] * blocks
         if orders > 1:
             left = samples - reported
@@ -365,7 +365,7 @@ class BlockFit:
         over = squares > reported - 1 + _CONTRADICTED * self._xp.root(2.0 * (reported - 1))
         np.maximum(usual, own * own + terms.v[1:], out=usual, where=over[:, None])
 
-    def _spread(self, weights: FloatArray) -> FloatArray:
+    def _covariance_of(self, weights: FloatArray) -> FloatArray:
         """Covariance (B, C, C) of the weighted sums; ``weights`` (B, C, N)."""
         xp = self._xp
         return xp.einsum('zas,zabs->zab', weights, xp.einsum('abts,zbt->zabs', self._between, weights))

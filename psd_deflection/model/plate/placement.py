@@ -33,7 +33,7 @@ SCALE = 0.1
 """m: the length that scales theta in a condition number or in the cost."""
 
 
-class Spread(NamedTuple):
+class PoseDeviations(NamedTuple):
     """Standard deviations of an estimate: m, m, rad."""
 
     dx: float
@@ -41,7 +41,7 @@ class Spread(NamedTuple):
     theta: float
 
 
-def spread_of_pair(centers: FloatArray, sigma: float) -> Spread:
+def deviations_of_pair(centers: FloatArray, sigma: float) -> PoseDeviations:
     """Deviations of (dX, dY, theta) at rest for two PSDs whose readings have deviation ``sigma``
     (m).
 
@@ -50,7 +50,7 @@ def spread_of_pair(centers: FloatArray, sigma: float) -> Spread:
     distance = math.hypot(*(centers[0] - centers[1]))
     middle_x, middle_y = (centers[0] + centers[1]) / 2.0
     theta = math.sqrt(2.0) * sigma / distance
-    return Spread(
+    return PoseDeviations(
         math.hypot(sigma / math.sqrt(2.0), middle_y * theta),
         math.hypot(sigma / math.sqrt(2.0), middle_x * theta),
         theta,
@@ -69,7 +69,7 @@ def ring(count: int, radius: float, azimuth: float = math.pi / 2.0) -> FloatArra
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
-def pose_spread(pose: FloatArray, centers: FloatArray, heights: FloatArray, sigma: float) -> FloatArray:
+def pose_deviations(pose: FloatArray, centers: FloatArray, heights: FloatArray, sigma: float) -> FloatArray:
     """Deviations (5,) of dX, dY m, theta, phi, omega rad, all five free, at ``pose`` (5,).
 
     Unknowns that the readings do not determine get infinity: both tilts at rest and, with two PSDs,
@@ -79,7 +79,7 @@ def pose_spread(pose: FloatArray, centers: FloatArray, heights: FloatArray, sigm
     return _deviations(jacobian, sigma)
 
 
-def slope_ratio_spread(
+def slope_ratio_deviations(
     pose: FloatArray, slope_ratio: float, link_length: float, centers: FloatArray, heights: FloatArray, sigma: float
 ) -> FloatArray:
     """Deviations (4,) of dX, dY, theta and k when the tilts are tied, phi = -k dY/L, omega = +k dX/L.
@@ -154,9 +154,9 @@ class Room:
         return np.asarray(np.unique(points[self.holds(points)], axis=0))
 
 
-def cost(spreads: FloatArray) -> FloatArray:
+def cost(deviations: FloatArray) -> FloatArray:
     """(...,): root of var dX + var dY + (0.1 m)^2 var theta, m, of (..., 3) deviations."""
-    return np.asarray(np.sqrt(np.sum((spreads * np.array([1.0, 1.0, SCALE])) ** 2, axis=-1)))
+    return np.asarray(np.sqrt(np.sum((deviations * np.array([1.0, 1.0, SCALE])) ** 2, axis=-1)))
 
 
 def _pair_costs(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -76,7 +76,7 @@ class BasePairSolver(Solver):
             self._matrix = np.eye(5)
         else:
             raise ConfigError(f'assume = {assume!r}: must be one of beam, no_twist, nothing')
-        self._spread, self._columns = self._matrix.tolist(), self._matrix.T.tolist()
+        self._to_pose, self._columns = self._matrix.tolist(), self._matrix.T.tolist()
         self._reject_what_is_unseen(geometry, assume)
 
     @classmethod
@@ -122,13 +122,13 @@ class BasePairSolver(Solver):
         """One block, pure floats. See :class:`Solver`."""
         measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
         found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances, self._xp)
-        xp, spread = self._xp, np.array(found.covariance)
-        covariance = xp.product(xp.product(self._matrix[:3], spread), self._matrix[:3].T).tolist()
+        xp, of_beams = self._xp, np.array(found.covariance)
+        covariance = xp.product(xp.product(self._matrix[:3], of_beams), self._matrix[:3].T).tolist()
         return answer(found, xp.product(self._matrix, np.array(found.parameters)).tolist(), covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         total = self._xp.total
-        dx, dy, theta, phi, omega = [total([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
+        dx, dy, theta, phi, omega = [total([a * b for a, b in zip(row, x, strict=True)]) for row in self._to_pose]
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for place in self._rows:

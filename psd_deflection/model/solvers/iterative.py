@@ -50,7 +50,7 @@ class IterativeSolver(Solver):
         xp = self._xp = geometry.arithmetic
         middle = xp.sum(beams, axis=0) / len(beams)
         self._lx, self._ly = middle.tolist()
-        self._spread = float(xp.sum(((beams - middle) ** 2).ravel(), axis=0))
+        self._squares = float(xp.sum(((beams - middle) ** 2).ravel(), axis=0))
         self._rows = tuple(map(tuple, np.hstack((geometry.centers, beams - middle)).tolist()))
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
@@ -119,8 +119,8 @@ class IterativeSolver(Solver):
         for i, (_, _, lx, ly) in enumerate(self._rows):
             vx = variances[2 * i]
             vy = variances[2 * i + 1]
-            px = (c * lx + s * ly) / self._spread
-            py = (c * ly - s * lx) / self._spread
+            px = (c * lx + s * ly) / self._squares
+            py = (c * ly - s * lx) / self._squares
             sum_x += vx
             sum_y += vy
             with_x += py * vx

@@ -49,8 +49,8 @@ class PoseSolver(Solver):
                 'nor ever its sign; stagger psd_N.height'
             )
         places = np.column_stack((geometry.beams, heights))
-        spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-        if spread[1] < SMALLEST_BASE_LINE:
+        singular_values = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        if singular_values[1] < SMALLEST_BASE_LINE:
             raise SolverError(
                 'the PSD surfaces lie on one line in space: turning the plate about it changes no dot, so that '
                 'twist and tilt cannot be told apart; move one PSD off the line'

@@ -73,13 +73,13 @@ class WlsExactSolver(Solver):
         yx /= sum_y
         yy /= sum_y
         xp = self._xp
-        spread = mixed = 0.0
+        squares = mixed = 0.0
         for i, (lx, ly) in enumerate(self._rows):
             wx = w[2 * i]
             wy = w[2 * i + 1]
-            spread += wx * xp.square(ly - xy) + wy * xp.square(lx - yx)
+            squares += wx * xp.square(ly - xy) + wy * xp.square(lx - yx)
             mixed += wx * (ly - xy) * lx - wy * (lx - yx) * ly
-        kappa = mixed / spread
+        kappa = mixed / squares
         sine = (linear.theta + kappa) / xp.hypot(1.0, kappa)
         if not -1.0 <= sine <= 1.0:
             status = SolverStatus.INADMISSIBLE if sine == sine else SolverStatus.NOT_CONVERGED

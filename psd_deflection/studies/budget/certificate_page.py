@@ -198,7 +198,7 @@ class Certified(StudyResult):
         for i, (axis, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
             errors = SHOWN[i] * np.array([error[i] for error in self.found.found])
             expanded = SHOWN[i] * np.array([uncertainty.uncertainty[i] for uncertainty in self.found.stated])
-            curve = Series('as found ± U', number, errors, 'blue', 'points', spread=expanded)
+            curve = Series('as found ± U', number, errors, 'blue', 'points', half_width=expanded)
             ends = () if limits is None else (-SHOWN[i] * limits[i], SHOWN[i] * limits[i])
             rules = [Rule(float(at), 'limit', across=True, colour='red') for at in ends]
             panels.append(Panel((curve,), 'pose', f'{axis} / {unit}', rules=rules, height=SMALL))

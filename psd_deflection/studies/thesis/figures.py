@@ -21,7 +21,7 @@ from psd_deflection.model.detector.sensors import Duolateral, Quadrant
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.plate.landing import landing
 from psd_deflection.model.plate.linear import design_matrix, gain_matrix
-from psd_deflection.model.plate.placement import pose_spread
+from psd_deflection.model.plate.placement import pose_deviations
 from psd_deflection.model.plate.plate import tied_pose
 from psd_deflection.model.solvers.registry import make_solver
 from psd_deflection.studies.thesis.comparison import (
@@ -275,7 +275,7 @@ def pose() -> Figure:
     at = np.array([0.1e-3, -2e-3, -0.015, 0.0, 0.0])
     deviations = []
     for step in steps:
-        deviation = pose_spread(at, centers, np.array([step, -step / 2, -step / 2]), 2e-6)
+        deviation = pose_deviations(at, centers, np.array([step, -step / 2, -step / 2]), 2e-6)
         deviations.append(MDEG * deviation[[3, 4, 2]])
     figure, ax = plt.subplots(figsize=(5.8, 3.6), layout='constrained')
     for values, label, color in zip(

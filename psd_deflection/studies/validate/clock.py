@@ -292,8 +292,8 @@ class UsedReferences:
         ramp = ramp - own * (float((w * own * ramp).sum()) / information)
         grows = float((w * ramp * ramp).sum())
         drift = float((w * ramp * residual).sum()) / grows if grows > 0.0 else 0.0
-        drift_spread = variance_of_sum((w * ramp * residual).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
-        drift_sd = math.sqrt(max(drift_spread, 1.0 / grows)) if grows > 0.0 else math.inf
+        drift_variance = variance_of_sum((w * ramp * residual).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
+        drift_sd = math.sqrt(max(drift_variance, 1.0 / grows)) if grows > 0.0 else math.inf
         return step, OffsetFit(0.0, math.sqrt(variance), drift, drift_sd, residual, sizes), next_weights
 
 

@@ -46,7 +46,7 @@ def test_what_a_load_adds_is_the_integral_of_the_covariance(kind: int) -> None:
 
     times = np.array([0.001, 0.02, 0.3])
     expected = solve_ivp(grows, (0.0, 0.3), np.zeros(16), t_eval=times, rtol=1e-10, atol=1e-15).y.T.reshape(-1, 4, 4)
-    np.testing.assert_allclose(MODE.spreads(times)[:, kind], expected, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(MODE.added_covariance(times)[:, kind], expected, rtol=1e-7, atol=1e-12)
 
 
 def by_samples(
@@ -54,7 +54,7 @@ def by_samples(
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """A Kalman filter, one sample after the other: state, covariance, NIS and log det of the innovations."""
     phi = expm(system(MODE) * PERIOD)
-    added = np.einsum('c,cij->ij', rate, MODE.spreads(np.array([PERIOD]))[0])
+    added = np.einsum('c,cij->ij', rate, MODE.added_covariance(np.array([PERIOD]))[0])
     squares = size = 0.0
     for n in range(20):
         x, p = phi @ x, phi @ p @ phi.T + added

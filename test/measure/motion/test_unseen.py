@@ -46,7 +46,7 @@ def test_what_the_process_noise_foresaw_is_not_added() -> None:
     held.add(at_rest(1e-3), wide, rate)
     mode = MODES[0]
     phi = mode.step(SECONDS)
-    foreseen = phi @ wide[0] @ phi.T + 1e-9 * mode.spreads(np.array([SECONDS]))[0].sum(axis=0)
+    foreseen = phi @ wide[0] @ phi.T + 1e-9 * mode.added_covariance(np.array([SECONDS]))[0].sum(axis=0)
     expected = LARGER**2 * np.maximum(np.array([1e-6, 0.0, 1e-6, 0.0]) / 9.0 - foreseen.diagonal(), 0.0)
     assert 0.0 < expected[0] < 0.9 * LARGER**2 * 1e-6 / 9.0
     np.testing.assert_allclose(held.variances[0, 0], expected, rtol=1e-12)

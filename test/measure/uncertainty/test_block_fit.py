@@ -117,7 +117,7 @@ class Dense:
         size = gamma.shape[2]
         later = np.subtract.outer(np.arange(size), np.arange(size)).T
         back = rotated.transpose(1, 0, 2)
-        self.spread = np.where(later >= 0, rotated[:, :, np.abs(later)], back[:, :, np.abs(later)])
+        self.noise_covariance = np.where(later >= 0, rotated[:, :, np.abs(later)], back[:, :, np.abs(later)])
         self.q = basis(size)
         orders = self.q.shape[1]
         powers = np.polynomial.polynomial.polyvander(np.arange(size) - 0.5 * (size - 1), orders - 1)
@@ -130,7 +130,7 @@ class Dense:
     def information(self, a: int, slots: IntArray, reported: int) -> FloatArray:
         """Covariance (told, told) of the coefficients by generalised least squares."""
         q = self.q[slots, :reported]
-        return np.asarray(np.linalg.inv(q.T @ np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)]) @ q))
+        return np.asarray(np.linalg.inv(q.T @ np.linalg.inv(self.noise_covariance[a, a][np.ix_(slots, slots)]) @ q))
 
     def usual(self) -> FloatArray:
         usual = np.maximum(self.late() - 0.5 * self.usual_v, 1e-9 * self.usual_v)
@@ -156,21 +156,21 @@ class Dense:
         before, q = self.usual(), self.q[slots]
         weights, more, value, misfit = np.zeros((4, self.size)), np.zeros(4), np.zeros(4), False
         for a in range(4):
-            precision = np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)])
-            spread = self.information(a, slots, reported)
-            c = spread @ q[:, :reported].T @ precision @ (z[a] - z[a].mean())
-            excess = c * c - np.diag(spread)
-            sure = np.minimum(self.usual_v[a, :reported] / np.diag(spread), 1.0) ** 2
+            precision = np.linalg.inv(self.noise_covariance[a, a][np.ix_(slots, slots)])
+            noise_covariance = self.information(a, slots, reported)
+            c = noise_covariance @ q[:, :reported].T @ precision @ (z[a] - z[a].mean())
+            excess = c * c - np.diag(noise_covariance)
+            sure = np.minimum(self.usual_v[a, :reported] / np.diag(noise_covariance), 1.0) ** 2
             self.squares[a, :reported] += (sure * excess - self.squares[a, :reported]) / 12.0
             self.weight[a, :reported] += (sure - self.weight[a, :reported]) / 12.0
             self.last(a, excess, sure)
             tau = self.usual()[a]
-            sudden = c * c > 16.0 * (np.diag(spread) + before[a, :reported])
+            sudden = c * c > 16.0 * (np.diag(noise_covariance) + before[a, :reported])
             tau[:reported] = np.where(sudden, np.maximum(excess, tau[:reported]), tau[:reported])
             if reported > 1 and n < self.size:
-                expected = spread[1:, 1:] + np.diag(tau[1:reported])
+                expected = noise_covariance[1:, 1:] + np.diag(tau[1:reported])
                 if c[1:] @ np.linalg.inv(expected) @ c[1:] > reported - 1 + 3.0 * (2.0 * (reported - 1)) ** 0.5:
-                    tau[1:reported] = np.maximum(tau[1:reported], (c * c + np.diag(spread))[1:])
+                    tau[1:reported] = np.maximum(tau[1:reported], (c * c + np.diag(noise_covariance))[1:])
             if a == 3:
                 # The length of the base line: what it does in one block is noise.
                 tau = before[a]
@@ -185,9 +185,9 @@ class Dense:
             if free > 0 and left @ precision @ left > free + 5.0 * (2.0 * free) ** 0.5:
                 misfit = True
                 more[a] += float(left @ left) / free
-        covariance = np.einsum('as,abst,bt->ab', weights, self.spread, weights) + np.diag(more)
-        dots, spread = self.of.back(value[None], covariance[None])
-        return tuple(dots[0].tolist()), spread[0], misfit
+        covariance = np.einsum('as,abst,bt->ab', weights, self.noise_covariance, weights) + np.diag(more)
+        dots, noise_covariance = self.of.back(value[None], covariance[None])
+        return tuple(dots[0].tolist()), noise_covariance[0], misfit
 
 
 @pytest.mark.parametrize('size', [5, 12, 20])

@@ -30,9 +30,9 @@ def test_the_first_ones_move_with_the_link_and_the_others_do_not(psds: int, unkn
     mixed = RNG.normal(size=(count, count))
     covariance = mixed @ mixed.T
     for row, z in zip(dots, of.of(dots).T, strict=True):
-        back, spread = of.back(z[None], covariance[None])
+        back, back_covariance = of.back(z[None], covariance[None])
         np.testing.assert_allclose(back[0], row, atol=1e-17)
-        np.testing.assert_allclose(spread[0], of.turn.T @ covariance @ of.turn, rtol=1e-12)
+        np.testing.assert_allclose(back_covariance[0], of.turn.T @ covariance @ of.turn, rtol=1e-12)
     # What does not move is of what the model leaves, if it is asked.
     half = combinations_of(centers, centers, slopes, lambda d: np.asarray(0.5 * d))
     np.testing.assert_allclose(half.fixed(dots), 0.5 * of.fixed(dots), rtol=1e-12)
@@ -64,8 +64,8 @@ def test_slopes_that_all_but_agree_with_a_reading_leave_no_rounding() -> None:
 
 def base_line_back(value: list[float], covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     of = combinations_of(CENTERS[:2], CENTERS[:2] + ZEROS[:2])
-    dots, spread = of.back(np.array([value]), covariance[None])
-    return dots[0], spread[0]
+    dots, back_covariance = of.back(np.array([value]), covariance[None])
+    return dots[0], back_covariance[0]
 
 
 def test_the_covariance_of_two_psds_goes_back_as_the_dots_do() -> None:
@@ -82,8 +82,8 @@ def test_the_covariance_of_two_psds_goes_back_as_the_dots_do() -> None:
         for step in (1e-6 * np.eye(4)).tolist()
     ]
     slopes = np.stack(columns, axis=1)
-    spread = base_line_back(value, covariance)[1]
-    np.testing.assert_allclose(spread, slopes @ covariance @ slopes.T, rtol=1e-6, atol=1e-8)
+    back_covariance = base_line_back(value, covariance)[1]
+    np.testing.assert_allclose(back_covariance, slopes @ covariance @ slopes.T, rtol=1e-6, atol=1e-8)
 
 
 def test_a_base_line_shorter_than_its_twist_has_a_hundredth_left_along() -> None:

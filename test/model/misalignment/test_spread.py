@@ -10,8 +10,8 @@ import pytest
 from psd_deflection.measure.estimation import SYSTEMATIC, ZERO_VARIANCES
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.misalignment.model import COUNT, INDEX, readings
+from psd_deflection.model.misalignment.parameter_covariance import ParameterCovariance
 from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
-from psd_deflection.model.misalignment.spread import ParameterSpread
 from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
 from psd_deflection.rig.config import Rig, rig_from_values
 from test import streams
@@ -69,16 +69,16 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
 
 
 def test_the_polynomial_is_what_it_stands_for() -> None:
-    from psd_deflection.model.misalignment.spread import dots_by_parameters
+    from psd_deflection.model.misalignment.parameter_covariance import dots_by_parameters
 
     rig = calibrated()
-    spread = ParameterSpread.from_rig(rig)
-    assert spread is not None
+    parameter_covariance = ParameterCovariance.from_rig(rig)
+    assert parameter_covariance is not None
     rng = np.random.default_rng(2)
     for dx, dy, theta in rng.uniform(-1.0, 1.0, (20, 3)) * (4e-3, 4e-3, 0.04):
         slopes = dots_by_parameters(vector_of_rig(rig).as_used, np.array([[dx], [dy], [theta]]), 0.585)[0]
         wanted = slopes @ known_of_rig(rig).covariance @ slopes.T
-        factor = spread.factor(dx, dy, theta)
+        factor = parameter_covariance.factor(dx, dy, theta)
         assert factor @ factor.T == pytest.approx(wanted, rel=2e-3, abs=1e-3 * float(np.diag(wanted).max()))
 
 

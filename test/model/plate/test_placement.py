@@ -32,7 +32,7 @@ MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
 def test_spreads_of_the_placements_compared(
     centers: FloatArray, expected: tuple[float, float, float], cond: float
 ) -> None:
-    closed = np.array(placement.spread_of_pair(centers, SIGMA))
+    closed = np.array(placement.deviations_of_pair(centers, SIGMA))
     assert closed * MICRO_MILLIDEGREE == pytest.approx(expected, abs=5e-3)
     design = design_matrix(centers)
     by_matrix = SIGMA * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
@@ -44,27 +44,27 @@ def test_three_sensors_see_tilt_only_when_staggered() -> None:
     ring = placement.ring(3, 0.100)
     tilted = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
     mdeg = math.degrees(1e3)
-    coplanar = placement.pose_spread(tilted, ring, np.zeros(3), SIGMA)
+    coplanar = placement.pose_deviations(tilted, ring, np.zeros(3), SIGMA)
     assert coplanar[3:] * mdeg == pytest.approx([178.0, 234.0], abs=0.5)
-    staggered = placement.pose_spread(tilted, ring, np.array([0.100, -0.050, -0.050]), SIGMA)
+    staggered = placement.pose_deviations(tilted, ring, np.array([0.100, -0.050, -0.050]), SIGMA)
     assert staggered[3:] * mdeg == pytest.approx([0.93, 1.32], abs=5e-3)
-    at_rest = placement.pose_spread(np.zeros(5), ring, np.zeros(3), SIGMA)
+    at_rest = placement.pose_deviations(np.zeros(5), ring, np.zeros(3), SIGMA)
     assert np.isfinite(at_rest).tolist() == [True, True, True, False, False]
 
 
 def test_two_sensors_leave_a_direction_unseen() -> None:
     tilted = np.array([0.001, 0.002, 0.01, 0.004, 0.003])
-    assert not np.any(np.isfinite(placement.pose_spread(tilted, THESIS, np.array([0.05, -0.05]), SIGMA)))
+    assert not np.any(np.isfinite(placement.pose_deviations(tilted, THESIS, np.array([0.05, -0.05]), SIGMA)))
 
 
 def test_the_slope_ratio_is_observed_by_the_height_between_opposite_sensors() -> None:
     # Along the bending direction y1 - y2 = (h1 - h2) k dY/L, so sigma(k) = sqrt(2) sigma L/(0.1 m |dY|).
     pose = np.array([0.0, -2.2271675e-3, 0.016418222])
-    got = placement.slope_ratio_spread(pose, 1.5, 0.585, placement.opposite(0.1), np.array([0.05, -0.05]), SIGMA)
+    got = placement.slope_ratio_deviations(pose, 1.5, 0.585, placement.opposite(0.1), np.array([0.05, -0.05]), SIGMA)
     by_hand = math.sqrt(2.0) * SIGMA * 0.585 / (0.1 * 2.2271675e-3)
     assert got[3] == pytest.approx(by_hand, rel=5e-3)
     # In one plane it is useless; across the bending direction, no better.
-    assert placement.slope_ratio_spread(pose, 1.5, 0.585, THESIS, np.zeros(2), SIGMA)[3] > 1.0
+    assert placement.slope_ratio_deviations(pose, 1.5, 0.585, THESIS, np.zeros(2), SIGMA)[3] > 1.0
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_the_search_beats_every_pair_of_a_finer_grid() -> None:
     base_square[base_square == 0.0] = 1e-12
     # var dX + var dY + (0.1 m)^2 var theta for sigma = 1, written out.
     costs = 1.0 + 2.0 / base_square * (np.sum(((first + second) / 2.0) ** 2, axis=-1) + 0.1**2)
-    found = float(placement.cost(np.array(placement.spread_of_pair(pair, 1.0))))
+    found = float(placement.cost(np.array(placement.deviations_of_pair(pair, 1.0))))
     assert found <= math.sqrt(float(np.min(costs)))
     assert found == pytest.approx(math.sqrt(float(np.min(costs))), rel=0.02)
 
@@ -168,7 +168,7 @@ def test_spreads_of_what_is_observed_are_those_of_dense_least_squares() -> None:
     ]
     jacobian = np.stack(columns, axis=1)
     want = SIGMA * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
-    assert placement.pose_spread(pose, centers, heights, SIGMA) == pytest.approx(want, rel=1e-5)
+    assert placement.pose_deviations(pose, centers, heights, SIGMA) == pytest.approx(want, rel=1e-5)
     # With the tilts tied by k = 1.5 and k unknown; rows are dX, dY, theta, k.
     flat = np.array([1e-3, -2e-3, 0.02])
 
@@ -179,5 +179,5 @@ def test_spreads_of_what_is_observed_are_those_of_dense_least_squares() -> None:
     x = np.array([*flat, 1.5])
     jacobian = np.stack([(tied(x + e) - tied(x - e)) / (2.0 * step) for e in step * np.eye(4)], axis=1)
     want = SIGMA * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
-    got = placement.slope_ratio_spread(flat, 1.5, 0.585, centers, heights, SIGMA)
+    got = placement.slope_ratio_deviations(flat, 1.5, 0.585, centers, heights, SIGMA)
     assert got == pytest.approx(want, rel=1e-5)

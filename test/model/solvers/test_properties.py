@@ -100,10 +100,10 @@ def test_a_cantilevers_pose_comes_back_with_its_tilts(
 
 
 @many
-@given(pose=poses, tilt=tilts, spread=st.floats(0.05, 0.15), step=st.floats(0.02, 0.1))
-def test_three_staggered_psds_see_the_tilts(rays: Any, pose: Any, tilt: Any, spread: float, step: float) -> None:
+@given(pose=poses, tilt=tilts, distance=st.floats(0.05, 0.15), step=st.floats(0.02, 0.1))
+def test_three_staggered_psds_see_the_tilts(rays: Any, pose: Any, tilt: Any, distance: float, step: float) -> None:
     turns = np.radians([0.0, 120.0, 240.0])
-    centers = spread * np.column_stack((np.cos(turns), np.sin(turns)))
+    centers = distance * np.column_stack((np.cos(turns), np.sin(turns)))
     geometry = Geometry(centers, np.full((3, 2), 1e-4), np.array([step, -step, -step / 2]), L)
     dots = rays.tip_dots(geometry, (*pose, *tilt))
     variances = (*UNEQUAL, 3e-12, 5e-12)

@@ -169,14 +169,14 @@ def test_newton_keeps_its_pace_where_the_dots_contradict_the_model() -> None:
     one = many.solve(tuple(dots.tolist()), tuple(variances.tolist()))
     assert one.status is SolverStatus.OK
     assert one.iterations <= 6, one
-    q, spread = SKEW.centers + dots.reshape(2, 2), variances.reshape(2, 2)
+    q, pairs = SKEW.centers + dots.reshape(2, 2), variances.reshape(2, 2)
 
     def cost(theta: Array) -> Array:
         """The smallest sum of squares at each angle: of two dots, what their difference is off."""
         lx, ly = SKEW.beams[0] - SKEW.beams[1]
         qx, qy = q[0] - q[1]
         off_x, off_y = qx - np.cos(theta) * lx - np.sin(theta) * ly, qy - np.cos(theta) * ly + np.sin(theta) * lx
-        return np.asarray(off_x**2 / spread[:, 0].sum() + off_y**2 / spread[:, 1].sum())
+        return np.asarray(off_x**2 / pairs[:, 0].sum() + off_y**2 / pairs[:, 1].sum())
 
     angles = np.linspace(-np.pi, np.pi, 200_001)
     assert one.theta == pytest.approx(float(angles[np.argmin(cost(angles))]), abs=4e-5)

@@ -122,9 +122,9 @@ def spots_of(index: int, *, status: BlockStatus = BlockStatus.OK, lost: int = 0)
     )
 
 
-def estimate_of(index: int, *, primary: bool = True, spread: float = 1.0) -> DeflectionEstimate:
+def estimate_of(index: int, *, primary: bool = True, scale: float = 1.0) -> DeflectionEstimate:
     phase = index / 10.0
-    sd = (2e-7 * spread, 3e-7 * spread, 3e-6 * spread)
+    sd = (2e-7 * scale, 3e-7 * scale, 3e-6 * scale)
     covariance = (sd[0] ** 2, 0.0, 0.0, 0.0, sd[1] ** 2, 0.0, 0.0, 0.0, sd[2] ** 2)
     return DeflectionEstimate(
         START_NS + index * BLOCK_NS,
@@ -153,12 +153,12 @@ class Serving:
         self.url = self.server.start()
         self.port = int(self.url.rstrip('/').rpartition(':')[2])
 
-    def give(self, first: int, count: int, *, spread: float = 1.0, every: int = 1, **options: Any) -> None:
+    def give(self, first: int, count: int, *, scale: float = 1.0, every: int = 1, **options: Any) -> None:
         """Blocks ``first`` and so on; ``every`` times as slowly as the rig would."""
         for index in range(first, first + count):
             t_ns = START_NS + index * every * BLOCK_NS
             if options.get('status', BlockStatus.OK) is BlockStatus.OK:
-                self.feed.put(estimate_of(index, spread=spread)._replace(t_ns=t_ns))
+                self.feed.put(estimate_of(index, scale=scale)._replace(t_ns=t_ns))
             self.feed.put(dataclasses.replace(spots_of(index, **options), t_ns=t_ns))
 
     def settle(self) -> None:

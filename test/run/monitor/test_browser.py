@@ -283,9 +283,9 @@ def test_a_lost_laser_is_observed(page: Page, start: Start) -> None:
 
 def test_the_bands_show_two_standard_deviations(page: Page, serve: Callable[..., Serving]) -> None:
     # A swing of +-0.573 deg with a standard deviation of 0.0002 or 0.17 deg; dX and dY likewise.
-    for spread, drawn in ((1.0, '< 0.02'), (1000.0, '> 0.1')):
+    for scale, drawn in ((1.0, '< 0.02'), (1000.0, '> 0.1')):
         serving = serve()
-        serving.give(0, 500, spread=spread)
+        serving.give(0, 500, scale=scale)
         page.open(serving.url)
         page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200', 'a trace of dY')
         for plot in ('#plot_shift', '#plot_theta'):

@@ -321,7 +321,7 @@ def test_the_chart_has_every_error_and_both_limits(certificate: Certificate) -> 
         assert panel.y_label == axis
         assert curve.x.tolist() == [1.0, 2.0, 3.0]
         assert curve.y == pytest.approx(SCALES[i] * certificate.found[:, i])
-        assert curve.spread == pytest.approx([SCALES[i] * message.uncertainty[i] for message in certificate.stated])
+        assert curve.half_width == pytest.approx([SCALES[i] * message.uncertainty[i] for message in certificate.stated])
         assert [rule.at for rule in panel.rules] == pytest.approx([-SCALES[i] * LIMITS[i], SCALES[i] * LIMITS[i]])
         assert all(rule.across for rule in panel.rules)
     assert all(not panel.rules for panel in _certified(certificate).chart().panels)

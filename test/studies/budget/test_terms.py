@@ -116,10 +116,10 @@ def test_the_total_agrees_with_drawing_everything_at_once(method: str) -> None:
 def test_noise_is_that_of_the_placement() -> None:
     at = _at((0.0, 0.0, 0.0))
     per_block = 2e-3 * 0.5e-3 / math.sqrt(20.0)
-    expected = placement.spread_of_pair(RIG.centers, per_block)
+    expected = placement.deviations_of_pair(RIG.centers, per_block)
     assert AMPLIFIER_NOISE.contribution(at).rms == pytest.approx(expected, rel=1e-9)
     step = 10.0 / 2**15 * 0.5e-3
-    expected = placement.spread_of_pair(RIG.centers, step / math.sqrt(12.0 * 20.0))
+    expected = placement.deviations_of_pair(RIG.centers, step / math.sqrt(12.0 * 20.0))
     assert QUANTISATION.contribution(at).rms == pytest.approx(expected, rel=1e-9)
     # At rest a stored zero is read with the same noise, so it counts once more.
     both = np.hypot(AMPLIFIER_NOISE.contribution(at).rms, QUANTISATION.contribution(at).rms)

@@ -68,8 +68,8 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
     linear = Linear(np.zeros((5, 4)), np.zeros((5, 4, 2)), rng.normal(size=(5, 4, 3)))
     noise = Noise(np.array([1e-6, 2e-6, 3e-6]), 1.5)
     each = weight_matrices(linear, rows, noise)
-    spread = linear.pose_slopes[2] @ np.diag(noise.reference**2) @ linear.pose_slopes[2].T
-    np.testing.assert_allclose(each[2], np.linalg.inv(spread + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
+    covariance = linear.pose_slopes[2] @ np.diag(noise.reference**2) @ linear.pose_slopes[2].T
+    np.testing.assert_allclose(each[2], np.linalg.inv(covariance + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
     np.testing.assert_allclose(weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)
 
 

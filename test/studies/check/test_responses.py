@@ -65,10 +65,10 @@ def test_slopes_are_least_squares_and_memory_widens_them() -> None:
     white = chance.normal(size=(201, 3))
     rest = np.column_stack((white[1:, 0], white[1:, 1] + 0.8 * white[:-1, 1], white[1:, 2] - 0.8 * white[:-1, 2]))
     values = design @ chance.normal(size=(6, 3)) + 1e-5 * rest
-    slopes, spread, variance = module.least_squares_fit(design, values)
+    slopes, covariance, variance = module.least_squares_fit(design, values)
     wanted, squares, _, _ = np.linalg.lstsq(design, values, rcond=None)
     assert slopes == pytest.approx(wanted, rel=1e-6)
-    assert spread == pytest.approx(np.linalg.inv(design.T @ design), rel=1e-6)
+    assert covariance == pytest.approx(np.linalg.inv(design.T @ design), rel=1e-6)
     left = values - design @ wanted
     memory = [float(r[1:] @ r[:-1] / (r @ r)) for r in left.T]
     widened = [(1.0 + max(m, 0.0)) / (1.0 - max(m, 0.0)) for m in memory]

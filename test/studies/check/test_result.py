@@ -196,15 +196,15 @@ def test_the_chart_has_a_panel_a_channel_two_beside_each_other_in_micrometres() 
     # On the channels of the file: x1 is turned.
     expected = [[1.0, 0.0], [0.0, 2.0], [1.0, 0.0], [0.01, -1.0]]
     moved = [[1.0, 0.0], [-2.04, 0.0], [0.0, -0.01], [4.0, 1000.0]]
-    spread = [[0.1, 0.1], [0.1, 0.2], [0.1, 0.3], [0.1, 0.4]]
+    sizes = [[0.1, 0.1], [0.1, 0.2], [0.1, 0.3], [0.1, 0.4]]
     for i, panel in enumerate(chart.panels):
         by_file, measured = panel.series
         assert by_file.x.tolist() == measured.x.tolist() == [1.0, 2.0]
         assert by_file.y == pytest.approx(expected[i])
         assert measured.y == pytest.approx(moved[i])
-        assert by_file.spread is None
-        assert measured.spread is not None
-        assert measured.spread == pytest.approx(spread[i])
+        assert by_file.sizes is None
+        assert measured.sizes is not None
+        assert measured.sizes == pytest.approx(sizes[i])
 
 
 def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:

@@ -675,9 +675,9 @@ def test_wild_values_count_as_six_deviations() -> None:
         low, high = cell.band
         f = np.abs(np.fft.fftfreq(50, 0.004))
         dof = int(((f >= low) & (f < (high if high < 125.0 else math.inf))).sum())
-        spread = 2.0 / (9.0 * dof)
+        deviation = 2.0 / (9.0 * dof)
         assert (cell.channel, cell.when[0]) == ('x1', 0.0)
-        assert cell.statistic == pytest.approx(((36.0 / 50.0) ** (1 / 3) - 1.0 + spread) / math.sqrt(spread))
+        assert cell.statistic == pytest.approx(((36.0 / 50.0) ** (1 / 3) - 1.0 + deviation) / math.sqrt(deviation))
         assert cell.energy == pytest.approx(3600.0 * dof / 50.0 - dof)
 
 

@@ -461,8 +461,8 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
         assert cell.p == pytest.approx(1.0 - (1.0 - p) ** 6, abs=1e-12)
         assert cell.statistic == pytest.approx(float(norm.isf(p)), abs=0.35)
         # Wilson and Hilferty: the cube root of a chi-square over its mean is normal.
-        spread = 2.0 / (9.0 * dof)
-        assert cell.statistic == pytest.approx(((energy / dof) ** (1 / 3) - 1.0 + spread) / math.sqrt(spread))
+        deviation = 2.0 / (9.0 * dof)
+        assert cell.statistic == pytest.approx(((energy / dof) ** (1 / 3) - 1.0 + deviation) / math.sqrt(deviation))
         assert found.map[case, c, 0] == cell.statistic
         assert cell.when == (0.0, LENGTHS[case] * period)
         assert cell.band == (0.0, 0.5 / period if period else 0.0)

@@ -683,8 +683,8 @@ def test_two_sizes_are_tied_if_their_ratio_is_one_within_the_fit(ratio: float, t
         k = fit.covariance()
         a, b = (e.values['x'] for e in fit.effects)
         # The spread of ln(a/b), with a floor of 0.3 %; against a flat law over two decades.
-        spread = math.sqrt(k[0, 0] / a**2 + k[1, 1] / b**2 - 2.0 * k[0, 1] / (a * b) + 0.003**2)
-        density = math.exp(-0.5 * (math.log(abs(a / b)) / spread) ** 2) / (spread * math.sqrt(2.0 * math.pi))
+        deviation = math.sqrt(k[0, 0] / a**2 + k[1, 1] / b**2 - 2.0 * k[0, 1] / (a * b) + 0.003**2)
+        density = math.exp(-0.5 * (math.log(abs(a / b)) / deviation) ** 2) / (deviation * math.sqrt(2.0 * math.pi))
         assert got[0].odds == pytest.approx(density * 2.0 * math.log(10.0), rel=1e-6)
         assert (got[0].members, got[0].unit) == (((0, 'x'), (1, 'x')), 'V')
 

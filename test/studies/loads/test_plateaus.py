@@ -286,7 +286,7 @@ GIVEN = load_rig(
 )
 
 
-SPREAD = np.array(
+VARIED = np.array(
     [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (20, 10, 5)], float
 )
 """Noted loads; each is like the others."""
@@ -294,7 +294,7 @@ SPREAD = np.array(
 
 def observed(
     more: dict[int, tuple[float, float, float]],
-    annotated: FloatArray = SPREAD,
+    annotated: FloatArray = VARIED,
     *,
     across: dict[int, float] | None = None,
     left: float = 0.0,
@@ -315,7 +315,7 @@ def observed(
 def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:
     found = observed({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
     assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
-    assert found.annotated.tolist() == SPREAD.tolist()
+    assert found.annotated.tolist() == VARIED.tolist()
 
 
 @pytest.mark.parametrize(
@@ -337,7 +337,7 @@ def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> 
 def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    found = plateaus.outliers(observed(more, SPREAD[:count]))
+    found = plateaus.outliers(observed(more, VARIED[:count]))
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
@@ -371,13 +371,13 @@ def test_a_faulty_detector_is_no_wrong_note() -> None:
 def test_two_of_eight_notes_beside_small_errors_are_wrong(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    twelve = np.vstack((SPREAD, SPREAD[1:5]))
+    twelve = np.vstack((VARIED, VARIED[1:5]))
     slightly = np.where(np.arange(count)[:, None] % 2, 0.1, -0.1) * (1.0, 0.0, 0.0)
     assert plateaus.outliers(observed(more, twelve[:count], everywhere=slightly)).gone == gone
 
 
 def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
-    softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
+    softened = 0.1 * VARIED @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
 
     def left(found: PlateauLoads, without: int) -> float:
         return float(np.delete(plateaus.deviation_in_tolerances(found, (without,), 0.1), without).max())
@@ -415,11 +415,11 @@ def test_a_wrong_load_is_known_if_the_others_span_it() -> None:
 
 def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> None:
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
-    loads = np.repeat(SPREAD, DWELL, axis=0)
+    loads = np.repeat(VARIED, DWELL, axis=0)
     for left, free in ((0.19, True), (0.21, False)):
         assert plateaus.all_free(observed(off, left=left), loads) is free
-    assert plateaus.all_free(observed({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, SPREAD[:4]), loads)
-    assert not plateaus.all_free(observed({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, SPREAD[:3]), loads)
+    assert plateaus.all_free(observed({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, VARIED[:4]), loads)
+    assert not plateaus.all_free(observed({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, VARIED[:3]), loads)
     # Two that are off by more than the tolerance are enough.
     two = observed({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
     apart = plateaus.deviation_in_tolerances(two, (), 0.1)
@@ -541,31 +541,31 @@ def world(
 def test_what_hung_is_what_readings_say_without_what_effects_do(
     wrong: dict[int, tuple[float, float, float]], share: float, offset: float, bend: float
 ) -> None:
-    annotated = SPREAD.copy()
+    annotated = VARIED.copy()
     for k, load in wrong.items():
         annotated[k] = load
     slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
-    asked = world(SPREAD, annotated, slopes, offset, bend)
+    asked = world(VARIED, annotated, slopes, offset, bend)
     found = plateaus.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked)
     assert [n.plateau.number for n in found] == sorted(wrong)
     for one in found:
-        assert one.applied == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
+        assert one.applied == pytest.approx(VARIED[one.plateau.number], abs=0.05)
         assert one.period == 1e-3
 
 
 @pytest.mark.parametrize(('applied', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
 def test_a_load_off_by_2_n_is_simulated_as_the_readings_say(applied: float, far: bool) -> None:
     # 46.67 - 40 is 2 + 4.667; 40 - 34 is 2 + 4, as the other force is 40.
-    truth = SPREAD.copy()
+    truth = VARIED.copy()
     truth[5] = (applied, -40.0, 20.0)
     asked_with = []
-    inner = world(truth, SPREAD, np.zeros((3, 3)))
+    inner = world(truth, VARIED, np.zeros((3, 3)))
 
     def asked(acting: FloatArray) -> PlateauLoads:
         asked_with.append(acting[5 * DWELL + 5].tolist())
         return inner(acting)
 
-    (note,) = plateaus.wrong_notes_against(np.repeat(SPREAD, DWELL, axis=0), 1e-3, asked)
+    (note,) = plateaus.wrong_notes_against(np.repeat(VARIED, DWELL, axis=0), 1e-3, asked)
     assert note.applied == pytest.approx(truth[5])
     assert asked_with[:2] == [[40.0, -40.0, 20.0], [0.0, 0.0, 0.0]]
     assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
@@ -580,7 +580,7 @@ def test_readings_are_compared_in_fine_means(
         rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: list[Plateau]
     ) -> PlateauLoads:
         held.append((difference, count, samples, size))
-        return observed({}, SPREAD[:0])
+        return observed({}, VARIED[:0])
 
     monkeypatch.setattr(plateaus, 'implied_loads', asked_for)
     loads = np.tile((1.0, -5.0, 2.0), (400, 1))
@@ -608,9 +608,9 @@ def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> N
         return plateaus.StandingOut((5,))
 
     monkeypatch.setattr(plateaus, 'outliers', stand_out)
-    truth = SPREAD + np.where(np.arange(8)[:, None] == 5, 3.0, 0.0)
+    truth = VARIED + np.where(np.arange(8)[:, None] == 5, 3.0, 0.0)
     (note,) = plateaus.wrong_notes_against(
-        np.repeat(SPREAD, DWELL, axis=0), 1e-3, world(truth, SPREAD, np.zeros((3, 3)))
+        np.repeat(VARIED, DWELL, axis=0), 1e-3, world(truth, VARIED, np.zeros((3, 3)))
     )
     assert note.applied == pytest.approx(truth[5])
     # A tenth, a fiftieth, nothing.
@@ -618,7 +618,7 @@ def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -> None:
-    loads, asked_with = np.repeat(SPREAD, DWELL, axis=0), list[FloatArray]()
+    loads, asked_with = np.repeat(VARIED, DWELL, axis=0), list[FloatArray]()
 
     def of_size(size: float) -> Callable[[FloatArray], PlateauLoads]:
         def asked(acting: FloatArray) -> PlateauLoads:
@@ -632,7 +632,7 @@ def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -
         asked_with.clear()
         assert plateaus.wrong_notes_against(loads, 1e-3, of_size(size)) == []
         assert len(asked_with) == asks
-    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: observed({}, SPREAD[:0])) == []
+    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: observed({}, VARIED[:0])) == []
 
 
 ONE_TORQUE = np.array(

@@ -334,7 +334,7 @@ def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, sti
     own = does - columns @ dense(columns, does, w)[0]
     ramp = does * np.tile(t, 3)
     ramp -= columns @ dense(columns, ramp, w)[0]
-    growth, spread = dense(np.column_stack([own, ramp]), left.T.ravel(), w)
+    growth, deviation = dense(np.column_stack([own, ramp]), left.T.ravel(), w)
     assert fit.drift == pytest.approx(growth[1], rel=1e-6)
     # No less than that of least squares, and more if what is left has a memory.
     scores = (w * own * left.T.ravel()).reshape(3, k).sum(axis=0)
@@ -342,7 +342,7 @@ def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, sti
     assert fit.sd == pytest.approx(np.sqrt(expected), rel=1e-6)
     rest = ramp - own * dense(own[:, None], ramp, w)[0]
     scores = (w * rest * left.T.ravel()).reshape(3, k).sum(axis=0)
-    expected = max(newey_west(scores) * spread[1, 1] ** 2, spread[1, 1])
+    expected = max(newey_west(scores) * deviation[1, 1] ** 2, deviation[1, 1])
     assert fit.drift_sd == pytest.approx(np.sqrt(expected), rel=1e-6)
 
 

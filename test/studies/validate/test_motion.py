@@ -42,8 +42,8 @@ def test_each_instant_has_the_polynomial_through_the_samples_about_it(exposure: 
             # From the instant, in samples.
             u = places[near] - instant
             fit = Polynomial.fit(u, motion.dots[near, channel], 4).convert()
-            spread = fit.integ()
-            mean = (spread(0.5 * exposure) - spread(-0.5 * exposure)) / exposure if exposure else fit(0.0)
+            deviation = fit.integ()
+            mean = (deviation(0.5 * exposure) - deviation(-0.5 * exposure)) / exposure if exposure else fit(0.0)
             ends = (fit(0.5 * exposure) - fit(-0.5 * exposure)) / exposure if exposure else fit.deriv()(0.0)
             assert values[i, channel] == pytest.approx(mean, rel=1e-9)
             assert rates[i, channel] == pytest.approx(ends / PERIOD, rel=1e-8)

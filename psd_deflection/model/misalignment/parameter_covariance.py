@@ -30,7 +30,7 @@ RANGE: FloatArray = np.array([0.006, 0.006, 0.06])
 LEVELS = 5
 
 
-class ParameterSpread:
+class ParameterCovariance:
     """The spread of the dots that the calibration of one rig file leaves. Make it with :meth:`from_rig`."""
 
     def __init__(self, values: FloatArray, covariance: FloatArray, length: float, xp: Arithmetic = FIXED) -> None:
@@ -51,7 +51,7 @@ class ParameterSpread:
     @classmethod
     def from_rig(
         cls, rig: Rig, zero_variances: tuple[float, ...] = (), effects: Sequence[ActiveEffect] | None = None
-    ) -> ParameterSpread | None:
+    ) -> ParameterCovariance | None:
         """None if the rig was not calibrated or its covariances are not to be total.
 
         ``zero_variances`` (4,) m^2: of a zero that was taken after the calibration. ``effects``: those of the rig, if
