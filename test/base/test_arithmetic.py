@@ -256,7 +256,7 @@ PIPELINE = (
     'model/plate/layout.py',
     'model/plate/linear.py',
     'model/misalignment/model.py',
-    'model/misalignment/spread.py',
+    'model/misalignment/parameter_covariance.py',
     'model/misalignment/rig.py',
     'model/link/statics.py',
     'model/simulation/optics.py',

@@ -17,7 +17,7 @@ from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs.find_discs import find_discs
 from psd_deflection.camera.discs.rim_classifier import sectors_of
-from psd_deflection.camera.discs.rim_model import Shape, moved, rotated
+from psd_deflection.camera.discs.rim_model import Shape, moved, rotation_matrix
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.image_size import declared_size
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
@@ -155,7 +155,7 @@ def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
     assert isinstance(board, Board)
     plane = np.stack(np.meshgrid(np.linspace(-0.03, 0.03, 6), np.linspace(-0.04, 0.04, 8)), axis=-1).reshape(-1, 2)
     facing = np.diag([1.0, -1.0, -1.0]) if view == 'outside' else np.eye(3)
-    true = facing @ rotated(np.array([0.2, -0.3, 0.4]))
+    true = facing @ rotation_matrix(np.array([0.2, -0.3, 0.4]))
     at = np.array([0.01, -0.02, 0.5])
     observed = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
     rotation, place = board.first_pose(plane, observed[:, :2] / observed[:, 2:])
