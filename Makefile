@@ -82,6 +82,7 @@ test-all: lint types contracts unit
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python -m tools.words
 
 types: $(READY)
 	$(BIN)/mypy

@@ -329,10 +329,10 @@ def test_parameters_have_units_and_ranges_and_are_rejected_by_name(start: Callab
     peer.until(lost, 'the lost laser in /diagnostics')
     assert put('sum_min', 2.5).successful
     peer.until_of_now(poses, 'estimates again')
-    each_parameter_says_what_it_takes(peer)
+    each_parameter_describes_itself(peer)
 
 
-def each_parameter_says_what_it_takes(peer: Any) -> None:
+def each_parameter_describes_itself(peer: Any) -> None:
     names = [p.name for p in PARAMETERS]
     request = DescribeParameters.Request(names=names)
     reported = peer.call(DescribeParameters, '/estimator/describe_parameters', request).descriptors

@@ -61,7 +61,9 @@ def test_velocity_prediction_and_innovations(kind: str, evaluated: dict[str, mot
 
 
 @pytest.mark.slow
-def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(evaluated: dict[str, motion.Result]) -> None:
+def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(
+    evaluated: dict[str, motion.Result],
+) -> None:
     swept = evaluated['chirp']
     # The frequency rises with time, from 0.5 Hz to 1.2 times that of the mode.
     for predicted, held in zip(np.array_split(swept.predicted, 8), np.array_split(swept.held, 8), strict=True):

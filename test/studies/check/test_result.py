@@ -58,7 +58,7 @@ CHECKUP = Checkup(
     findings=(),
     values={},
     pushes=PUSHES,
-    half_width=(1.5, -0.5),
+    sizes=(1.5, -0.5),
     wirings=(WiringFit(Wiring(), 0.1),),
     levels=LEVELS,
     drift=np.array([1.0, -2.0, 0.0, -1e-4]) * 1e-6 / 60.0,
@@ -146,7 +146,7 @@ def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
     assert [s.title for s in CHECKUP.sections()] == [titles[0], titles[2]]
     (first, *_) = found.sections()
     assert len(first.parts) == 2
-    (first, *_) = replace(CHECKUP, pushes=(), half_width=()).sections()
+    (first, *_) = replace(CHECKUP, pushes=(), sizes=()).sections()
     assert len(first.parts) == 1
 
 
@@ -158,11 +158,11 @@ def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> Non
     assert beside == ['+Y with +θ', '+0.0', '+0.0', '+0.0', '+1000.0', '  rig file:', '0', '+', '0', '-', '0.50']
     # Rounded to a tenth of a micrometre.
     near = replace(PUSHES[0], channels=np.array([1.0499995e-6, 1.0500005e-6, 0.0, 0.0]))
-    assert push_rows(replace(CHECKUP, pushes=(near,), half_width=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
+    assert push_rows(replace(CHECKUP, pushes=(near,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
     # One push that has a size is enough for a column.
     assert [row[-1] for row in push_rows(replace(CHECKUP, pushes=PUSHES[::-1]))] == ['size', '1.50', '']
     # A push that was not seen has none either, and then there is no column.
-    assert [len(row) for row in push_rows(replace(CHECKUP, half_width=(1.5, math.nan)))] == [10, 10, 10]
+    assert [len(row) for row in push_rows(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
     assert CHECKUP.lines()[1].split() == [
         'push',
@@ -196,7 +196,7 @@ def test_the_chart_has_a_panel_a_channel_two_beside_each_other_in_micrometres() 
     # On the channels of the file: x1 is turned.
     expected = [[1.0, 0.0], [0.0, 2.0], [1.0, 0.0], [0.01, -1.0]]
     moved = [[1.0, 0.0], [-2.04, 0.0], [0.0, -0.01], [4.0, 1000.0]]
-    half_width = [[0.1, 0.1], [0.1, 0.2], [0.1, 0.3], [0.1, 0.4]]
+    spread = [[0.1, 0.1], [0.1, 0.2], [0.1, 0.3], [0.1, 0.4]]
     for i, panel in enumerate(chart.panels):
         by_file, measured = panel.series
         assert by_file.x.tolist() == measured.x.tolist() == [1.0, 2.0]
@@ -204,7 +204,7 @@ def test_the_chart_has_a_panel_a_channel_two_beside_each_other_in_micrometres() 
         assert measured.y == pytest.approx(moved[i])
         assert by_file.half_width is None
         assert measured.half_width is not None
-        assert measured.half_width == pytest.approx(half_width[i])
+        assert measured.half_width == pytest.approx(spread[i])
 
 
 def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
