@@ -111,9 +111,9 @@ def answer(peer: str, observed: Sequence[Observation], rig: Rig, without: Sequen
     pictures = Pictures(machine)
     chosen = PEERS[peer](pictures)
     named = [pictures.screen.candidates[i].effect.name for i in chosen]
-    if machine.recorded.quantisation is not None:
+    if machine.recorded.value_grid is not None:
         # The readings say so before any search.
-        named.append(machine.recorded.quantisation.effect.name)
+        named.append(machine.recorded.value_grid.effect.name)
     floor, left = pictures.ws.floor(), pictures.left(chosen)
     return {
         'effects': [{'name': name} for name in dict.fromkeys(named) if name not in SETUP],

@@ -36,7 +36,7 @@ FINISHED = {
     'hear': 'feed',
     'rival': 'alternative',
     'rivals': 'alternatives',
-    'lattice': 'quantisation',
+    'lattice': 'value_grid',
     'gathered': 'buffered',
     'foretold': 'predicted',
     'coasts': 'predictions_only',

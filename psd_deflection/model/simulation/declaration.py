@@ -25,7 +25,7 @@ from psd_deflection.rig.parameters import Parameter, check_value, shown
 Stage = Literal['load', 'link', 'optics', 'psd', 'electronics']
 Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']
 Kind = Literal['amplitude', 'coupled', 'phase', 'shape', 'choice']
-Proposal = Literal['', 'spectral', 'line', 'highest', 'highest_dots', 'quantisation', 'quantisation_dots']
+Proposal = Literal['', 'spectral', 'line', 'highest', 'highest_dots', 'value_grid', 'value_grid_dots']
 Use = Literal['time', 'temperature']
 State = dict[str, Any]
 Values = Mapping[str, float]
@@ -61,7 +61,7 @@ class EffectParameter:
 
     ``propose``: how the values to try are found in the recordings, or a function of the choices that returns
     this. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
-    phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums; ``quantisation``: the
+    phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums; ``value_grid``: the
     step on whose multiples all readings lie, and then the effect is named without a search; ``lattice_dots``: the same
     without the sums. ``of_psd``: the PSD that it is
     of, from 3: a rig without that PSD has no such parameter. ``power``: the
@@ -286,14 +286,14 @@ class Effect:
         return next((part.corrected for part in self.further if part.corrected), '')
 
     @property
-    def quantisation(self) -> str:
+    def value_grid(self) -> str:
         """The name of the parameter that is the step of all readings, '' if there is none."""
         first = next(self.variants())
-        return next((p.name for p in self.parameters if p.proposed_by(first) == 'quantisation'), '')
+        return next((p.name for p in self.parameters if p.proposed_by(first) == 'value_grid'), '')
 
     def steps_sums(self, values: Values) -> bool:
         """Whether with ``values`` the step is that of the sums, too."""
-        return self.parameter(self.quantisation).proposed_by(values) == 'quantisation'
+        return self.parameter(self.value_grid).proposed_by(values) == 'value_grid'
 
     def parameter(self, name: str) -> EffectParameter:
         """The declared parameter of that name (KeyError if there is none)."""

@@ -22,7 +22,7 @@ from psd_deflection.studies.discover.free_loads import searched
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem, Progress
-from psd_deflection.studies.discover.recorded_rig import RecordedRig, quantisation_gain, rig_of, workspace_of
+from psd_deflection.studies.discover.recorded_rig import RecordedRig, rig_of, value_grid_gain, workspace_of
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.coincidence import coincidences
@@ -74,7 +74,7 @@ def law(problem: Problem) -> Problem:
     """Return a law for what remains, and the fit without the effects that only stood in for it."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     # Coarse steps cause noise that varies with the signal, which is no law.
-    if rig_of(problem).recorded.quantisation is not None:
+    if rig_of(problem).recorded.value_grid is not None:
         return problem
     much = ws.gap(fit.difference) > SIGNIFICANT * ws.floor()
     if not (unknown_of(problem.residual, 1.0) or much or coincidences(fit, ws.physics)):
@@ -109,13 +109,13 @@ def set_up(problem: Problem) -> Problem:
             values |= lines
     setup += wrong_load_findings(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
-    if machine.recorded.quantisation is not None and not machine.recorded.quantisation_stated:
-        quantisation = machine.recorded.quantisation
-        named.append(_named_quantisation(ws, quantisation))
-        step = float(quantisation.values[quantisation.effect.quantisation])
+    if machine.recorded.value_grid is not None and not machine.recorded.value_grid_stated:
+        value_grid = machine.recorded.value_grid
+        named.append(_named_value_grid(ws, value_grid))
+        step = float(value_grid.values[value_grid.effect.value_grid])
         # The effect stands for the line: with both, the steps would be counted twice.
         steps = np.full(3 * ws.psds, step)
-        finer = not quantisation.effect.steps_sums(quantisation.values)
+        finer = not value_grid.effect.steps_sums(value_grid.values)
         if finer:
             steps[2::3] = 0.0
         setup += step_findings(ws.observations[0].rig, steps, finer=finer)[0]
@@ -130,7 +130,7 @@ def set_up(problem: Problem) -> Problem:
 
 def noise_level(problem: Problem) -> Problem:
     """Return whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
-    if problem.unknown or rig_of(problem).recorded.quantisation is not None:
+    if problem.unknown or rig_of(problem).recorded.value_grid is not None:
         return problem
     ws = workspace_of(problem.comparison)
     more, _ = noise_findings(ws.observations[0].rig, noise_of(ws))
@@ -160,13 +160,13 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
     return (float(most[0]), float(most[1]), float(most[2]))
 
 
-def _named_quantisation(workspace: Workspace, quantisation: ActiveEffect) -> NamedEffect:
+def _named_value_grid(workspace: Workspace, value_grid: ActiveEffect) -> NamedEffect:
     """Return the named effect of coarse steps, which the readings themselves show."""
-    gain = quantisation_gain(workspace, quantisation)
+    gain = value_grid_gain(workspace, value_grid)
     sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     return NamedEffect(
-        active=quantisation,
-        sd={quantisation.effect.quantisation: sd},
+        active=value_grid,
+        sd={value_grid.effect.value_grid: sd},
         p=0.0,
         delta_bic=2.0 * gain,
         heldout=HeldOut(gain, float(np.sqrt(2.0 * gain))),

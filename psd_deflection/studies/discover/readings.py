@@ -117,7 +117,7 @@ class ReadingsPlant(Plant):
         self.library = tuple(
             e
             for effect in effects_for(tables[0].psds)
-            if effect.name not in without and not effect.quantisation and (e := self._observable(effect)) is not None
+            if effect.name not in without and not effect.value_grid and (e := self._observable(effect)) is not None
         )
 
     def measured(self) -> Sequence[FloatArray]:

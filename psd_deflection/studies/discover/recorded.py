@@ -49,8 +49,8 @@ MOST_MEASURED = 40
 class Recorded:
     """``observations`` of the ``rig``, whose file has the effects ``known``. ``without``: effects that are not looked
     for. ``findings``: what was wrong, with ``values`` that put the rig file right. ``stated_gap``: m, before loads and
-    wiring were put right, 0 if they were right. ``quantisation``: the effect of coarse steps that the readings show;
-    ``quantisation_stated``: the rig file has it.
+    wiring were put right, 0 if they were right. ``value_grid``: the effect of coarse steps that the readings show;
+    ``value_grid_stated``: the rig file has it.
     ``delays``: by how much the loads may be noted late, s. ``corrected``: of each recording, its loads as they were put
     right, if they were. ``wrong``: where another load hung than noted; it is free.
     ``fourth``: what the readings say of themselves.
@@ -63,8 +63,8 @@ class Recorded:
     findings: tuple[Finding, ...] = ()
     values: Mapping[str, object] = field(default_factory=dict)
     stated_gap: float = 0.0
-    quantisation: ActiveEffect | None = None
-    quantisation_stated: bool = False
+    value_grid: ActiveEffect | None = None
+    value_grid_stated: bool = False
     delays: tuple[float, ...] = ()
     corrected: tuple[CorrectedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
@@ -73,11 +73,7 @@ class Recorded:
     @property
     def stated(self) -> tuple[ActiveEffect, ...]:
         """The effects that the rig file has."""
-        return (
-            (*self.known, self.quantisation)
-            if self.quantisation is not None and self.quantisation_stated
-            else self.known
-        )
+        return (*self.known, self.value_grid) if self.value_grid is not None and self.value_grid_stated else self.known
 
     @property
     def physics(self) -> Physics:
@@ -133,8 +129,8 @@ def put_right(recorded: Recorded) -> Recorded:
 
 def snapped(recorded: Recorded) -> Recorded:
     """With the coarse steps of the converter, if all readings lie on such, or all positions."""
-    effects = [e for e in catalogue().values() if e.quantisation and e.name not in recorded.without]
-    stated = [a for a in recorded.known if a.effect.quantisation]
+    effects = [e for e in catalogue().values() if e.value_grid and e.name not in recorded.without]
+    stated = [a for a in recorded.known if a.effect.value_grid]
     step = _common_step(recorded.observations) if effects or stated else None
     if step is None:
         return recorded
@@ -144,13 +140,11 @@ def snapped(recorded: Recorded) -> Recorded:
     observations = tuple(_with_volts(o, _on_steps(o.volts, rows, step.step)) for o in recorded.observations)
     if stated:
         known = tuple(a for a in recorded.known if a is not stated[0])
-        return replace(
-            recorded, observations=observations, known=known, quantisation=stated[0], quantisation_stated=True
-        )
+        return replace(recorded, observations=observations, known=known, value_grid=stated[0], value_grid_stated=True)
     effect = effects[0]
     choice = next(v for v in effect.variants() if effect.steps_sums(v) == step.sums)
-    values = {**effect.off_values(recorded.physics, choice), effect.quantisation: step.step}
-    return replace(recorded, observations=observations, quantisation=ActiveEffect(effect, values))
+    values = {**effect.off_values(recorded.physics, choice), effect.value_grid: step.step}
+    return replace(recorded, observations=observations, value_grid=ActiveEffect(effect, values))
 
 
 def _common_step(observations: Sequence[Observation]) -> CoarseStep | None:

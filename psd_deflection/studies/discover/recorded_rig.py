@@ -71,8 +71,8 @@ class RecordedRig(Machine):
         bank_of_rig = SignatureBank() if bank is None or changed else bank
         bank_of_rig.nominal(workspace)
         proposals = proposals_of(workspace)
-        if recorded.quantisation is not None:
-            workspace = workspace.replaced(base=(*workspace.base, recorded.quantisation))
+        if recorded.value_grid is not None:
+            workspace = workspace.replaced(base=(*workspace.base, recorded.value_grid))
         return cls(recorded=recorded, workspace=workspace, proposals=proposals, bank=bank_of_rig)
 
     def compared(self) -> Workspace:
@@ -81,14 +81,14 @@ class RecordedRig(Machine):
 
     def bare(self, comparison: Comparison) -> Comparison:
         """Without the coarse steps."""
-        if self.recorded.quantisation is None:
+        if self.recorded.value_grid is None:
             return comparison
-        return comparison.replaced(base=tuple(a for a in comparison.base if a is not self.recorded.quantisation))
+        return comparison.replaced(base=tuple(a for a in comparison.base if a is not self.recorded.value_grid))
 
     def chi_square_explained(self, comparison: Comparison) -> float:
         """Chi-square that the coarse steps explain."""
-        quantisation = self.recorded.quantisation
-        return 0.0 if quantisation is None else 2.0 * quantisation_gain(workspace_of(comparison), quantisation)
+        value_grid = self.recorded.value_grid
+        return 0.0 if value_grid is None else 2.0 * value_grid_gain(workspace_of(comparison), value_grid)
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
         """Return the catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
@@ -96,7 +96,7 @@ class RecordedRig(Machine):
         residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
         more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual), ws.psds)
         more = [e for e in more if e.name not in FIRST or e.name in ws.first]
-        library = [e for e in effects_for(ws.psds) if e.name not in self.recorded.without and not e.quantisation]
+        library = [e for e in effects_for(ws.psds) if e.name not in self.recorded.without and not e.value_grid]
         values = self.proposals
         if fit is not None and fit.effects:
             # A large effect hides the spectral lines of a small one.
@@ -173,11 +173,11 @@ def proposals_of(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> 
     }
 
 
-def quantisation_gain(workspace: Workspace, quantisation: ActiveEffect) -> float:
+def value_grid_gain(workspace: Workspace, value_grid: ActiveEffect) -> float:
     """Log-likelihood of all readings lying on the lattice: by chance each does so with probability LSB/step."""
     lsb = workspace.observations[0].rig.converter.volts_per_count
     return (
         workspace.size
         * workspace.fine[0]
-        * float(np.log(max(quantisation.values[quantisation.effect.quantisation] / lsb, 1.0)))
+        * float(np.log(max(value_grid.values[value_grid.effect.value_grid] / lsb, 1.0)))
     )

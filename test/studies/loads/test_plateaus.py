@@ -263,7 +263,7 @@ def test_steps_without_a_note_are_looked_for_in_the_dots_in_metres(monkeypatch: 
         looked.append(dots)
         return [2.0, 5.5]
 
-    monkeypatch.setattr(plateaus, 'unnoted_steps', unannotated)
+    monkeypatch.setattr(plateaus, 'unannotated_steps', unannotated)
     volts, loads = np.random.default_rng(1).normal(size=(9000, 6)), np.zeros((9000, 3))
     loads[4000:] = 1.0
     listed = plateaus.plateaus(GIVEN, volts, loads)

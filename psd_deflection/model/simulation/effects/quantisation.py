@@ -58,7 +58,7 @@ EFFECT = Effect(
             10.0,
             1e-3,
             'its step',
-            propose=lambda values: 'quantisation' if values['sums'] else 'quantisation_dots',
+            propose=lambda values: 'value_grid' if values['sums'] else 'value_grid_dots',
         ),
         EffectParameter(
             'sums', '', 0, 1, 1, '1: the sum signals step as well', nominal=1, kind='choice', choices=(1, 0)

@@ -88,7 +88,7 @@ class Workspace(Comparison):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.acting, o.temperature)
             difference = o.volts - chunk.volts.T
             # Coarse steps hide the noise of a reading that rests.
-            share = 0.25 if any(a.effect.quantisation for a in effects) else LEAST_NOISE
+            share = 0.25 if any(a.effect.value_grid for a in effects) else LEAST_NOISE
             floors = np.maximum(share * o.rig.noises.ravel(), o.rig.converter.volts_per_count / np.sqrt(12.0))
             noise = estimate_noise(o, difference, size, floors)
             present = self._present[i]
