@@ -47,6 +47,10 @@ at most: 20 ms stay 20 ms within 4 us.
 """
 EARLY_NS = 50_000_000
 """A sample that arrives this much earlier than the map allows: the device's clock jumped ahead."""
+DRAINING = 1.2
+"""While what a late line held back arrives, device time passes faster than host time by this factor at least."""
+DRAINED_NS = 2_000_000
+"""Meanwhile a sample this early shows that those before it were late."""
 MAX_SKEW = 1e-4
 STRAY_POINTS = 3
 STRAY_NS = 2_000_000
@@ -75,8 +79,10 @@ class ClockMap:
 
     def __init__(self) -> None:
         self.resets = 0
-        # By how much stamps of one device time became later when the map started again, ns.
+        # By how much stamps of one device time became later as the map stepped, ns.
         self.stepped_ns = 0
+        # Whether what a late line held back arrives now.
+        self.drains = False
         self._started = False
         self._start(0, 0)
 
@@ -91,6 +97,8 @@ class ClockMap:
         self._mapped = device_ns - SECOND_NS
         self._skew = 0.0
         self._last_device = device_ns
+        self._last_host = host_ns
+        self.drains = False
         self._residual = 0.0
         self._round_trip: int | None = None
 
@@ -109,9 +117,17 @@ class ClockMap:
         early_ns = self._host(device) - t_host_ns
         delay = t_host_ns - device
         bucket = (device - self._origin) // SECOND_NS
-        if device < self._last_device or early_ns > EARLY_NS or (bucket != self._bucket and self._second_was_late()):
-            return self._restart(device, delay, early_ns, passed_us)
-        self._last_device = device
+        passed = device - self._last_device
+        self.drains = (
+            self.drains
+            and passed_us is not None
+            and passed > DRAINING * (t_host_ns - self._last_host)
+            and abs(passed - 1000.0 * passed_us) < 0.1 * passed
+        )
+        early = early_ns > (DRAINED_NS if self.drains else EARLY_NS)
+        if passed < 0 or early or (bucket != self._bucket and self._second_was_late()):
+            return self._restart(device, delay, early_ns if early else 0, passed_us)
+        self._last_device, self._last_host = device, t_host_ns
         if bucket != self._bucket:
             self._close_second(bucket, device)
         if self._bucket_min is None or delay < self._bucket_min[1]:
@@ -133,11 +149,12 @@ class ClockMap:
             passed_us is not None
             and device > self._last_device
             and abs(device - self._last_device - passed_us * 1000.0) < EARLY_NS
-            and early_ns > EARLY_NS
+            and early_ns > 0
         )
         self.resets += not steady
-        self.stepped_ns = -early_ns if steady else 0
+        self.stepped_ns -= early_ns if steady else 0
         self._start(device, device + delay)
+        self.drains = steady
         self._bucket_min = (device, delay)
         return not steady
 
@@ -152,6 +169,7 @@ class ClockMap:
         """The clock cannot be followed: begin again with this pair."""
         device = t_device_us * 1000
         self.resets += 1
+        self.stepped_ns += t_host_ns - self._host(device)
         self._start(device, t_host_ns)
         self._bucket_min = (device, t_host_ns - device)
 
@@ -168,7 +186,7 @@ class ClockMap:
         if self._bucket_min is not None:
             device, delay = self._bucket_min
             self._bucket_min = (device + by, delay - by) if device <= before else None
-        self.stepped_ns = -by
+        self.stepped_ns -= by
 
     def host_ns(self, t_device_us: int) -> int:
         """Where the map has this device time now."""

@@ -14,9 +14,9 @@ from psd_deflection.cli.main import main
 from psd_deflection.cli.recordings.info import _lines_of_parameters
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.bag_writer import BagWriter
-from psd_deflection.records import SampleBlock
+from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, ParameterChange, SampleBlock
 from psd_deflection.rig.config import load_rig
-from test.recordings.making import HELLO, T0, block, write_bag
+from test.recordings.making import HELLO, STEP, T0, block, write_bag
 
 
 @pytest.fixture
@@ -45,6 +45,29 @@ def test_info_says_what_another_rig_has_as_in_the_thesis(tmp_path: Path, capsys:
     assert 'dynamics.bending_frequency = 14.0 Hz' in capsys.readouterr().out
     assert main(['info', str(write_bag(tmp_path / 'thesis', {'sum_min': 1.5}))]) == 0
     assert 'as in the thesis rig' not in capsys.readouterr().out
+
+
+def test_a_step_of_the_time_map_has_its_time_and_is_no_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Three seconds come 1.5 s late; the 1500 samples that came then are 1 ns apart."""
+    run = tmp_path / 'run'
+    with BagWriter(run, rig_values={'block_size': 20}) as bag:
+        for n in range(300):
+            made = block(n)
+            seq = made.seq
+            late = np.select([seq < 3000, seq < 4500], [(seq + 1500) * STEP, 4499 * STEP + seq - 2999], seq * STEP)
+            bag.put(SampleBlock(n, seq, T0 + late, made.volts, made.flags))
+            if n == 225:
+                bag.put(ParameterChange(T0 + 4519 * STEP, n, ((CLOCK_STEP, -1.5),)))
+                bag.put(ParameterChange(T0 + 4519 * STEP, n, ((CLOCK_SQUEEZED, 1500.0),)))
+    assert main(['info', str(run)]) == 0
+    shown = capsys.readouterr().out
+    assert '1, the largest at 3.019 s by -1500.0 ms: stamps before it are off by as much' in shown
+    assert '1500 samples have stamps 1 ns apart after a step back' in shown
+    for since in ('0', '2.5', '3.0'):
+        assert main(['replay', str(run), '--from', since]) in (0, 1)
+        shown = ''.join(capsys.readouterr())
+        assert 'samples' in shown
+        assert 'samples a second' not in shown
 
 
 def test_info_names_the_recorded_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import INFO, WARNING, null_log, texts
 from psd_deflection.devices import contract_frames, port_source
-from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
+from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, SampleFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, RESTART
@@ -153,6 +153,7 @@ def test_a_note_of_the_time_map_takes_no_block_s_room(sample: Any) -> None:
     acquisition.feed([sample(s) for s in range(20)], 10**9)
     # 0.3 s of samples within a millisecond: the map steps.
     acquisition.feed([sample(s) for s in range(20, 320)], 10**9 + 10**6)
+    acquisition.feed([sample(s) for s in range(320, 340)], 10**9 + 21 * 10**6)
     items = [acquisition.queue.get() for _ in range(acquisition.queue.qsize())]
     assert any(isinstance(item, Annotation) for item in items)
     assert numbers(items) == list(range(40))
@@ -356,35 +357,76 @@ def test_a_device_clock_jump_is_reported_and_stamps_increase(
     assert numbers(items) == list(range(80))
 
 
-@pytest.mark.parametrize('late_s', [0.1, 1.5])
-def test_a_line_that_is_late_at_first_is_reported_and_recorded(late_s: float, sample: Any) -> None:
-    """All bytes of the first three seconds come late. No sample is missing, and each stamp is right or noted."""
-    lines: list[str] = []
-    acquisition = Acquisition(load_rig(), lambda text, _level=0: lines.append(text))
-    ends_ms = 3000 + round(late_s * 1000)
-    given: dict[int, int] = {}
-    annotated: dict[str, list[float]] = {}
-    fed = 0
-    for now_ms in range(round(late_s * 1000) + 10, 9000, 10):
-        # What was sent when the line recovers comes with the first that is in time.
-        sent = now_ms - round(late_s * 1000) if now_ms < ends_ms else now_ms
-        acquisition.feed([sample(k, t_us=10**6 + 1000 * k) for k in range(fed, sent)], now_ms * 10**6)
-        fed = sent
-        while not acquisition.queue.empty():
-            item = acquisition.queue.get()
+class Fed:
+    """An acquisition that is fed with what the test makes up; what it hands over, by sample number.
+
+    ``t_ns``: stamp less the time at which the test sampled it. ``steps``, ``squeezed``: what is noted for the
+    recording, with the number of the last sample before it.
+    """
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.acquisition = Acquisition(load_rig(), lambda text, _level=0: self.lines.append(text))
+        self.off_ns: dict[int, int] = {}
+        self.steps: list[tuple[int, float]] = []
+        self.squeezed = 0.0
+
+    def read(self, now_ms: int, samples: list[SampleFrame]) -> None:
+        # What has waited comes in reads of 4096 bytes.
+        for n in range(0, len(samples), 150):
+            self.acquisition.feed(samples[n : n + 150], now_ms * 10**6 + n * 10_000)
+            self._take()
+
+    def _take(self) -> None:
+        while not self.acquisition.queue.empty():
+            item = self.acquisition.queue.get()
             if isinstance(item, Arrival):
-                times = item.raw.t_ns - acquisition.to_ros_ns
-                given |= dict(zip(item.raw.seq.tolist(), times.tolist(), strict=True))
+                times = item.raw.t_ns - self.acquisition.to_ros_ns
+                self.off_ns |= {int(k): int(t) - int(k) * 10**6 for k, t in zip(item.raw.seq, times, strict=True)}
             elif isinstance(item, Annotation):
-                annotated.setdefault(item.change.values[0][0], []).append(float(item.change.values[0][1]))  # type: ignore[arg-type]
-    assert list(given) == list(range(min(given), max(given) + 1))
-    assert annotated[CLOCK_STEP] == [pytest.approx(-late_s, abs=0.011)]
-    assert sum(annotated[CLOCK_SQUEEZED]) == pytest.approx(1000 * late_s, abs=25)
-    wrong = [k for k, t_ns in given.items() if abs(t_ns - k * 10**6) > 5_000_000]
-    assert wrong == list(range(min(given), max(wrong) + 1))
-    assert max(wrong) == pytest.approx(3000 + 1000 * late_s, abs=25)
-    assert any(f'{1000 * late_s:.0f}' in line and 'too late' in line for line in lines), lines
-    assert any(f'{sum(annotated[CLOCK_SQUEEZED]):.0f} samples have stamps 1 ns apart' in line for line in lines)
+                ((name, value),) = item.change.values
+                if name == CLOCK_STEP:
+                    self.steps.append((max(self.off_ns), float(value)))  # type: ignore[arg-type]
+                else:
+                    assert name == CLOCK_SQUEEZED
+                    self.squeezed += float(value)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize('late_s', [0.1, 1.5, 10.0])
+def test_a_line_that_is_late_at_first_is_reported_and_recorded(late_s: float, sample: Any) -> None:
+    """All bytes come late for three seconds. No sample is missing, and each stamp is right or noted."""
+    fed, sent, late_ms = Fed(), 0, round(late_s * 1000)
+    for now_ms in range(late_ms + 10, late_ms + 6000, 10):
+        # What was sent when the line recovers comes with the first that is in time.
+        to = now_ms - late_ms if now_ms < late_ms + 3000 else now_ms
+        fed.read(now_ms, [sample(k, t_us=10**6 + 1000 * k) for k in range(sent, to)])
+        sent = to
+    assert list(fed.off_ns) == list(range(min(fed.off_ns), max(fed.off_ns) + 1))
+    ((_, step),) = fed.steps
+    assert step == pytest.approx(-late_s, abs=0.011)
+    assert fed.squeezed == pytest.approx(1000 * late_s, abs=25)
+    wrong = [k for k, off_ns in fed.off_ns.items() if abs(off_ns) > 5_000_000]
+    assert wrong == list(range(min(fed.off_ns), max(wrong) + 1))
+    # What has waited takes a hundredth of its time to come.
+    assert max(wrong) == pytest.approx(3000 + late_ms, abs=25 + 0.01 * late_ms)
+    assert any(f'{late_ms}' in line and 'too late' in line for line in fed.lines), fed.lines
+    assert any(f'{fed.squeezed:.0f} samples have stamps 1 ns apart' in line for line in fed.lines)
+
+
+@pytest.mark.parametrize('rate', [2.0, 1.05, 0.98, 0.5])
+def test_a_clock_that_changes_its_rate_has_each_step_noted(rate: float, sample: Any) -> None:
+    """After ten seconds; every stamp is off by no more than the next step says."""
+    fed = Fed()
+    for now_ms in range(10, 25_000, 10):
+        clock = [round(k * 1000 + max(k - 10_000, 0) * 1000 * (rate - 1.0)) for k in range(now_ms - 10, now_ms)]
+        fed.read(now_ms, [sample(k, t_us=t_us) for k, t_us in zip(range(now_ms - 10, now_ms), clock, strict=True)])
+    assert len(fed.steps) >= 5
+    assert all((step < 0.0) == (rate > 1.0) for _, step in fed.steps)
+    first = 0
+    for last, step in fed.steps:
+        assert max(abs(fed.off_ns[k]) for k in range(first, last + 1)) < 1e9 * abs(step) + 5e6
+        first = last + 1
+    assert any('the time map steps' in line for line in fed.lines)
 
 
 class Clockwork(Source):

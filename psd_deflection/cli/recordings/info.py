@@ -211,8 +211,9 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
     if found['restarts']:
         out.append(row('restarts', f'{found["restarts"]} of the device'))
     if found['clock_steps']:
-        worst = max((step['step_s'] for step in found['clock_steps']), key=abs)
-        text = f'{len(found["clock_steps"])}, the largest {worst * 1e3:+.1f} ms: stamps before it are off by as much'
+        worst = max(found['clock_steps'], key=lambda step: abs(step['step_s']))
+        at, size = f'{(worst["t_ns"] - start) / 1e9:.3f} s', f'{worst["step_s"] * 1e3:+.1f} ms'
+        text = f'{len(found["clock_steps"])}, the largest at {at} by {size}: stamps before it are off by as much'
         out.append(row('clock steps', text))
     if found['squeezed']:
         out.append(row('squeezed', f'{found["squeezed"]} samples have stamps 1 ns apart after a step back'))

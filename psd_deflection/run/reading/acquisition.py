@@ -337,7 +337,6 @@ class Acquisition:
         good = False
         if self._clock.newest(events, now):
             self._jumped(now)
-        self._note_step(now)
         for frame in events:
             if type(frame) is SampleFrame or type(frame) is Sample:
                 good = True
@@ -359,7 +358,6 @@ class Acquisition:
                     self._enqueue(now)
                     if self._clock.observe(seq, t, now):
                         self._jumped(now)
-                    self._note_step(now)
                 elif self._clock.lags(number, t, now):
                     self._enqueue(now)
                     self._clock.lay_anew(number, seq, t, now)
@@ -399,10 +397,9 @@ class Acquisition:
         self.counters.clock_jumps += 1
         text = f"{self._name}: the device's clock jumped by {step_us / 1e3:+.1f} ms; the time map follows"
         self._limited_log.log('jump', text, WARNING, now / 1e9, NEWS)
-        self._note_step(now)
 
     def _note_step(self, now: int) -> None:
-        """Log and record a step of the time map."""
+        """Log and record by how much the time map has stepped; the steps of a line that recovers are one."""
         step_ns = self._clock.take_step_ns()
         if abs(step_ns) < MAP_STEP_NS:
             return
@@ -419,9 +416,12 @@ class Acquisition:
             self.queue.put(Annotation(ParameterChange(self._last_t_ns, block, ((name, value),))))
 
     def _note_squeezed(self, squeezed: int, now: int) -> None:
-        """Count samples whose stamps had to be raised; log and record them when there are no more."""
+        """Count samples whose stamps had to be raised; log and record them, and the step, when there are no more."""
         self._squeezed += squeezed
-        if squeezed or not self._squeezed:
+        if squeezed or self._clock.drains:
+            return
+        self._note_step(now)
+        if not self._squeezed:
             return
         count, self._squeezed = self._squeezed, 0
         self.counters.squeezed += count

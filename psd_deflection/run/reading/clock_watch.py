@@ -165,6 +165,11 @@ class ClockWatch:
             self._past = number, t_us
         return step_us
 
+    @property
+    def drains(self) -> bool:
+        """Whether what a late line held back arrives now: the map steps on."""
+        return self._map.drains
+
     def take_step_ns(self) -> int:
         """By how much later the same device time is stamped since this was asked last, ns: a step of the map."""
         step, self._map.stepped_ns = self._map.stepped_ns, 0
