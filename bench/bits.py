@@ -129,7 +129,7 @@ def estimates_of(folder: Path) -> str:
 
 def table(jobs: int, folder: Path) -> bool:
     """Print the table; whether no bit differs."""
-    every, left_out = settings()
+    every, excluded = settings()
     places = {}
     for i, setting in enumerate(every):
         places[setting.name] = folder / str(i)
@@ -156,7 +156,7 @@ def table(jobs: int, folder: Path) -> bool:
         f'{len(every)} settings, {equal} messages each ({", ".join(NAMES)}): '
         + ('no bit differs' if not total else f'{total} differ')
     )
-    for kernel in left_out:
+    for kernel in excluded:
         print(f'not tried: {kernel}, which this processor cannot run')
     return total == 0
 

@@ -63,7 +63,7 @@ def unshaped() -> float:
     return played(move())
 
 
-def left(by: Shaper) -> float:
+def residual(by: Shaper) -> float:
     """Amplitude after the shaped move over that after the move as it is."""
     return (
         played(TrajectoryShaper(by).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
@@ -78,7 +78,7 @@ def rows() -> list[tuple[str, ...]]:
     """Shaper, what it adds to the move, and what is left for each of ``WRONG``."""
     out = []
     for kind in KINDS:
-        shares = [left(shaper(kind, FREQUENCY * wrong, RATIO)) for wrong in WRONG]
+        shares = [residual(shaper(kind, FREQUENCY * wrong, RATIO)) for wrong in WRONG]
         longer = shaper(kind, FREQUENCY, RATIO).duration
         out.append((kind.upper(), f'{1e3 * longer:.0f} ms', *(f'{100.0 * share:.1f} %' for share in shares)))
     return out

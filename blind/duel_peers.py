@@ -117,8 +117,8 @@ def sindy(plant: Silverbox) -> tuple[str, Answers]:
 
     def wrong(threshold: float) -> float:
         last = min(cut + 3000, end)
-        left = simulated(fitted(threshold, cut - begin), cut, last) - plant.y[cut:last]
-        return float(np.sum(left**2)) if np.isfinite(left).all() else np.inf
+        residual = simulated(fitted(threshold, cut - begin), cut, last) - plant.y[cut:last]
+        return float(np.sum(residual**2)) if np.isfinite(residual).all() else np.inf
 
     best = min(THRESHOLDS, key=wrong)
     c = fitted(best, end - begin)
@@ -186,17 +186,17 @@ def best_subset(plant: Plant, most: int = 3, is_linear: bool = False) -> Subset:
     y = _vector(plant.measured())
     parts = np.concatenate([np.tile(p + 1000 * i, len(plant.channels)) for i, p in enumerate(plant.parts())])
     every = np.ones(len(y), dtype=bool)
-    left = _linear(plant, y) if is_linear else _bent(plant, y)
+    residual = _linear(plant, y) if is_linear else _bent(plant, y)
 
     def bic(effects: Sequence[Effect]) -> float:
-        return float(len(y) * np.log(np.sum(left(effects, every) ** 2)) + len(effects) * np.log(len(y)))
+        return float(len(y) * np.log(np.sum(residual(effects, every) ** 2)) + len(effects) * np.log(len(y)))
 
     sets = [s for n in range(most + 1) for s in itertools.combinations(plant.library, n)]
     best = min(sets, key=bic)
     unseen = np.zeros(len(y))
     for part in np.unique(parts):
-        unseen[parts == part] = left(best, parts != part)[parts == part]
-    return Subset(tuple(e.name for e in best), rms(left(best, every)), rms(unseen))
+        unseen[parts == part] = residual(best, parts != part)[parts == part]
+    return Subset(tuple(e.name for e in best), rms(residual(best, every)), rms(unseen))
 
 
 def rms(values: FloatArray) -> float:
@@ -204,7 +204,7 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-Left = Callable[[Sequence[Effect], BoolArray], FloatArray]
+Residual = Callable[[Sequence[Effect], BoolArray], FloatArray]
 """What effects leave of all values if their sizes are fitted to some of them."""
 
 
@@ -216,14 +216,14 @@ def _model(effects: Sequence[Effect], x: FloatArray) -> Model:
     return {e.name: {e.parameters[0].name: float(v)} for e, v in zip(effects, x, strict=True)}
 
 
-def _linear(plant: Plant, y: FloatArray) -> Left:
+def _linear(plant: Plant, y: FloatArray) -> Residual:
     """By linear least squares over the pictures of the effects."""
     nothing = _vector(plant.simulate({}))
     pictures = {
         e.name: _vector(plant.simulate(_model([e], np.ones(1)))) - nothing for e in (*plant.nuisance, *plant.library)
     }
 
-    def left(effects: Sequence[Effect], observed: BoolArray) -> FloatArray:
+    def residual(effects: Sequence[Effect], observed: BoolArray) -> FloatArray:
         names = [e.name for e in (*plant.nuisance, *effects)]
         if not names:
             return y - nothing
@@ -231,13 +231,13 @@ def _linear(plant: Plant, y: FloatArray) -> Left:
         sizes = np.linalg.lstsq(table[observed], (y - nothing)[observed], rcond=None)[0]
         return np.asarray(y - nothing - table @ sizes)
 
-    return left
+    return residual
 
 
-def _bent(plant: Plant, y: FloatArray) -> Left:
+def _bent(plant: Plant, y: FloatArray) -> Residual:
     """By least squares within the bounds, from where the effects are off."""
 
-    def left(effects: Sequence[Effect], observed: BoolArray) -> FloatArray:
+    def residual(effects: Sequence[Effect], observed: BoolArray) -> FloatArray:
         used = [*plant.nuisance, *effects]
         if not used:
             return y - _vector(plant.simulate({}))
@@ -254,4 +254,4 @@ def _bent(plant: Plant, y: FloatArray) -> Left:
 
         return apart(np.asarray(least_squares(some, start, bounds=(low, high), x_scale=size).x))
 
-    return left
+    return residual

@@ -78,7 +78,7 @@ class Duel:
     sha256: str
     source: str
     lacks: str
-    left_out: str
+    excluded: str
     run: Callable[[Path, Progress], Answer] | None
 
 
@@ -162,8 +162,8 @@ def tests_of(plant: Silverbox, simulated: Callable[[tuple[int, int]], FloatArray
     """Of each test the rms error, mV, and its share of the standard deviation, %."""
     out = {}
     for name, span in TESTS.items():
-        left, share = rmse(plant.y[slice(*span)], simulated(span))
-        out[name] = 1e3 * left, 1e2 * share
+        residual, share = rmse(plant.y[slice(*span)], simulated(span))
+        out[name] = 1e3 * residual, 1e2 * share
     return out
 
 
@@ -319,13 +319,13 @@ def rows(name: str, duel: Duel, folder: Path, progress: Progress) -> tuple[str, 
     path = folder / duel.file
     if not path.is_file():
         why = f'not run: {duel.file} is not there'
-        return line(name, duel.source, '', duel.lacks, duel.left_out, why), [line(name, why, '', '', '', '')]
+        return line(name, duel.source, '', duel.lacks, duel.excluded, why), [line(name, why, '', '', '', '')]
     known = checked(path, duel.sha256)
     if duel.run is None:
         why = 'not run: there is no model of it here'
-        return line(name, duel.source, known, duel.lacks, duel.left_out, why), [line(name, why, '', '', '', '')]
+        return line(name, duel.source, known, duel.lacks, duel.excluded, why), [line(name, why, '', '', '', '')]
     answer = duel.run(folder, progress)
-    first = line(name, duel.source, known, duel.lacks, duel.left_out, answer.message)
+    first = line(name, duel.source, known, duel.lacks, duel.excluded, answer.message)
     return first, [figure_row(name, f) for f in answer.figures]
 
 

@@ -51,8 +51,8 @@ def lines(found: PlantDiscovery) -> list[str]:
         out.append(f'  {name}: {before:.4g} -> {after:.4g}, on unseen cases {found.heldout_per_channel[name]:.4g}')
     out += [f'  unknown: {u.signature}' for u in found.unknown]
     if found.remainder is not None and found.remainder.function is not None:
-        left = found.remainder.function.heldout_as_shaped
-        out.append(f'  with its shape from all cases {left:.4g} remain on unseen cases')
+        residual = found.remainder.function.heldout_as_shaped
+        out.append(f'  with its shape from all cases {residual:.4g} remain on unseen cases')
     return [*out, f'  {found.simulations} simulations']
 
 

@@ -83,9 +83,9 @@ def sindy(path: Path) -> tuple[list[str], str, Array]:
     for threshold, alpha in itertools.product(np.geomspace(0.1, 100.0, 13).tolist(), (1e-6, 1e-2, 1.0)):
         fit = pysindy.STLSQ(threshold=threshold, alpha=alpha).fit(table[inner], y[inner, None])
         c = np.asarray(fit.coef_).ravel()
-        left = float(np.sum((y[choice] - table[choice] @ c) ** 2)) + np.log(len(y)) * int(np.count_nonzero(c))
-        if best is None or left < best[0]:
-            best = left, c
+        score = float(np.sum((y[choice] - table[choice] @ c) ** 2)) + np.log(len(y)) * int(np.count_nonzero(c))
+        if best is None or score < best[0]:
+            best = score, c
     if best is None:
         return [], '', y
     c = best[1]
@@ -137,9 +137,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     right = closed = 0
     paths = sorted(args.folder.glob('law-*.npz'))
     for path in paths:
-        variables, words, left = {'sindy': sindy, 'adcd': adcd}[args.what](path)
+        variables, words, score = {'sindy': sindy, 'adcd': adcd}[args.what](path)
         _, _, _, truth, fitted = _data(path)
-        floors = float(np.sqrt(np.mean(left[~fitted] ** 2)))
+        floors = float(np.sqrt(np.mean(score[~fitted] ** 2)))
         right += variables == truth['variables']
         closed += floors <= MOST_FLOORS
         print(f'{path.stem} {truth["form"]} of {truth["variables"]}: {variables}, {floors:.2f} floors: {words[:120]}')

@@ -20,7 +20,7 @@ from blind.arm import Arm
 from blind.auxtel import AuxTel
 from blind.boom import Boom
 from blind.campaign import options
-from blind.duel_peers import BoolArray, Left, _bent, _linear, _vector, rms
+from blind.duel_peers import BoolArray, Residual, _bent, _linear, _vector, rms
 from blind.emps import Emps
 from blind.measured import DATA
 from psd_deflection.records import FloatArray
@@ -57,7 +57,7 @@ def ours(make: Callable[[], Plant], tables: Sequence[FloatArray], hidden: Sequen
     return _vector([t - s for t, s in zip(tables, message, strict=True)])
 
 
-def forward_backward(plant: Plant, left: Left, observed: BoolArray) -> FloatArray:
+def forward_backward(plant: Plant, residual: Residual, observed: BoolArray) -> FloatArray:
     """What is left of all values by terms chosen and fitted with those that are ``observed``."""
     count = int(observed.sum())
     terms = range(len(plant.library))
@@ -65,7 +65,7 @@ def forward_backward(plant: Plant, left: Left, observed: BoolArray) -> FloatArra
 
     def of(chosen: frozenset[int]) -> FloatArray:
         if chosen not in kept:
-            kept[chosen] = left([plant.library[j] for j in sorted(chosen)], observed)
+            kept[chosen] = residual([plant.library[j] for j in sorted(chosen)], observed)
         return kept[chosen]
 
     def bic(chosen: frozenset[int]) -> float:
@@ -120,13 +120,13 @@ def unseen(make: Callable[[], Plant], is_linear: bool, log: Callable[[str], None
     y = _vector(tables)
     folds = _folds(plant)
     row_folds = _vector([np.tile(f, (len(plant.channels), 1)) for f in folds])
-    left = _linear(plant, y) if is_linear else _bent(plant, y)
+    residual = _linear(plant, y) if is_linear else _bent(plant, y)
     out: dict[str, FloatArray] = {}
     for fold in np.unique(row_folds):
         hidden = row_folds == fold
         answers = {
             'discover_in': ours(make, tables, [f == fold for f in folds]),
-            'forward-backward BIC': forward_backward(plant, left, ~hidden & np.isfinite(y)),
+            'forward-backward BIC': forward_backward(plant, residual, ~hidden & np.isfinite(y)),
         }
         if is_linear:
             answers['STLSQ'] = stlsq(plant, y, ~hidden & np.isfinite(y))

@@ -188,5 +188,5 @@ class Silverbox(Plant):
 
 def rmse(y: FloatArray, model: FloatArray, start: int = START) -> tuple[float, float]:
     """Root mean square of the error after ``start`` samples, and its share of the standard deviation of ``y`` there."""
-    left = float(np.sqrt(np.mean((y[start:] - model[start:]) ** 2)))
-    return left, left / float(np.std(y[start:]))
+    residual = float(np.sqrt(np.mean((y[start:] - model[start:]) ** 2)))
+    return residual, residual / float(np.std(y[start:]))

@@ -62,7 +62,7 @@ class Pictures:
         at = self.columns(chosen)
         return self._penalty * len(at) - float(self.sizes(chosen) @ self._pull[at]) if at else 0.0
 
-    def left(self, chosen: Sequence[int]) -> float:
+    def remaining(self, chosen: Sequence[int]) -> float:
         """Return the gap that these leave, m."""
         if not chosen:
             return self.ws.gap(self.null.difference)
@@ -114,10 +114,10 @@ def answer(peer: str, observed: Sequence[Observation], rig: Rig, without: Sequen
     if machine.recorded.value_grid is not None:
         # The readings say so before any search.
         named.append(machine.recorded.value_grid.effect.name)
-    floor, left = pictures.ws.floor(), pictures.left(chosen)
+    floor, remaining = pictures.ws.floor(), pictures.remaining(chosen)
     return {
         'effects': [{'name': name} for name in dict.fromkeys(named) if name not in SETUP],
         'setup': [{'name': name, 'where': '', 'value': None} for name in dict.fromkeys(named) if name in SETUP],
-        'unknown': [{}] if left > score.THRESHOLDS['unsaid_floors'] * floor else [],
-        'remaining': {'floors': left / floor},
+        'unknown': [{}] if remaining > score.THRESHOLDS['unsaid_floors'] * floor else [],
+        'remaining': {'floors': remaining / floor},
     }

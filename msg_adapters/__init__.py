@@ -132,7 +132,7 @@ def _of_psd(psd: int) -> Callable[[str, SpotMeans], Iterator[Item]]:
         if not spots.published:
             return
         measured = spots.status in _MEASURED
-        lost = not measured and (not spots.left_out or psd in spots.left_out)
+        lost = not measured and (not spots.excluded or psd in spots.excluded)
         if psd <= len(spots.sums) and not lost and all(map(math.isfinite, spots.dots)):
             yield name, spots.t_ns, spots
 

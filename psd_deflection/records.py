@@ -112,7 +112,7 @@ class SpotMeans:
     ``t_ns``: middle of the block. ``dots``: (x1, y1, x2, y2, ...), m, from each PSD's centre.
     ``sums``: (sum1, sum2, ...), V. ``covariance`` (2P, 2P): sample covariance of the dots, m^2 (zeros if
     fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is empty
-    when ``status`` is OK. ``findings``: warnings that do not prevent an estimate. ``left_out``: PSDs (from 1) that
+    when ``status`` is OK. ``findings``: warnings that do not prevent an estimate. ``excluded``: PSDs (from 1) that
     the estimate was made without, if the others were enough for it. ``published``: whether the dots are; of most blocks
     they are not, if the parameter ``decimation`` says so.
     """
@@ -127,7 +127,7 @@ class SpotMeans:
     status: BlockStatus
     reason: str
     findings: tuple[str, ...] = ()
-    left_out: tuple[int, ...] = ()
+    excluded: tuple[int, ...] = ()
     published: bool = True
 
 

@@ -238,7 +238,7 @@ def test_without_one_psd_the_estimate_goes_on_from_the_others(
     assert len(found) == len(spots) == 180
     assert_inside(records, truth)
     after = [s for s in spots if s.index * 20 >= FAILS]
-    assert {s.left_out for s in after} == {(psd + 1,)}
+    assert {s.excluded for s in after} == {(psd + 1,)}
     assert {s.status for s in after} == {BlockStatus.LASER_LOST if fault is dark else BlockStatus.SATURATED}
     assert pipeline.counters.degraded == len(after) == 90
     assert sum(isinstance(r, TipLoad) for r in records) == 180
@@ -261,14 +261,14 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     found, spots = primaries(records), spots_of(records)
     assert len(found) == 180
     assert_inside(records, truth)
-    left_out = [s.left_out for s in spots if s.index * 20 >= FAILS]
-    assert left_out.count((psd + 1,)) > 30
-    assert left_out.count((psd + 1,)) + left_out.count(()) == 90
-    assert not any(s.left_out for s in spots if s.index * 20 < FAILS)
+    excluded = [s.excluded for s in spots if s.index * 20 >= FAILS]
+    assert excluded.count((psd + 1,)) > 30
+    assert excluded.count((psd + 1,)) + excluded.count(()) == 90
+    assert not any(s.excluded for s in spots if s.index * 20 < FAILS)
     assert pipeline.estimator.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
     assert f'psd_{psd + 1} contradicts the others and is left out' in pipeline.counters.findings
     # What is left agrees.
-    good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.left_out]
+    good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.excluded]
     assert np.mean(good) < 2.0
 
 
@@ -284,7 +284,7 @@ def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig,
 def test_a_stuck_psd_reports_on_itself_where_the_check_cannot(three: Rig) -> None:
     records, truth, _ = run(three, stuck(1))
     assert_inside(records, truth)
-    assert [s.left_out for s in spots_of(records)].count((2,)) > 70
+    assert [s.excluded for s in spots_of(records)].count((2,)) > 70
 
 
 def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: Rig) -> None:
@@ -294,7 +294,7 @@ def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: 
     counts[:, 6:] = np.rint(np.array([0.0, 0.0, 5.0]) / STEP)
     pipeline = Pipeline(rig)
     spots = spots_of(list(pipeline.process(chunk_of(counts))))
-    assert {s.left_out for s in spots} == {(1,)}
+    assert {s.excluded for s in spots} == {(1,)}
     assert (pipeline.counters.estimates, pipeline.counters.degraded) == (10, 10)
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
@@ -309,7 +309,7 @@ def test_reject_rejects_only_what_cannot_be_reported(three: Rig) -> None:
     assert spots_of(not_reported)[-1].reason.startswith('the readings contradict each other')
     reported, _, pipeline = run(with_solver(three, 'exact', consistency='report', **LEVEL), inverted(2))
     assert len(primaries(reported)) == 180
-    assert not any(s.left_out for s in spots_of(reported))
+    assert not any(s.excluded for s in spots_of(reported))
     assert pipeline.estimator.contradictions > 60
 
 
@@ -346,8 +346,8 @@ def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
     rig = with_solver(three, 'exact', **LEVEL, **{**FOURTH, 'psd_4.height': 0.0})
     records, truth, pipeline = run(rig, spoil)
     assert_inside(records, truth)
-    assert spots_of(records)[100].left_out == (4,)
-    assert spots_of(records)[-1].left_out == (1, 4)
+    assert spots_of(records)[100].excluded == (4,)
+    assert spots_of(records)[-1].excluded == (1, 4)
     assert pipeline.estimator.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
 
 

@@ -388,7 +388,7 @@ class Pipeline:
             status=status,
             reason=reason,
             findings=findings,
-            left_out=self.estimator.excluded,
+            excluded=self.estimator.excluded,
             published=observed.due,
         )
         yield self.last_spots

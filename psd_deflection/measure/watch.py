@@ -302,7 +302,7 @@ class Watch:
 
     def _block(self, spots: SpotMeans) -> None:
         estimate, reported = self._estimate, self._reported
-        sound = spots.status is BlockStatus.OK and not spots.left_out
+        sound = spots.status is BlockStatus.OK and not spots.excluded
         if not sound or estimate is None or estimate.block != spots.index:
             self._drop()
             return

@@ -267,8 +267,8 @@ def estimates_entry(
         rule = pipeline.rig.estimator.degraded
         level = WARN
         how = f'from one detector, twist {"held" if rule == "hold" else "assumed 0"}'
-        if spots.left_out:
-            how = f'without {" and ".join(f"psd_{psd}" for psd in spots.left_out)}'
+        if spots.excluded:
+            how = f'without {" and ".join(f"psd_{psd}" for psd in spots.excluded)}'
         why = spots.reason or next((f for f in spots.findings if 'left out' in f), '')
         message = f'degraded: {new.degraded} of {new.blocks} blocks {how}; {why}'
     elif doubt := _doubt(pipeline, new.contradictions):

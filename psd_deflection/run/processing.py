@@ -233,7 +233,7 @@ class Processing:
         text = f'no estimate: {spots.reason}'
         if cause and estimate is not None:
             cause += ' degraded'
-            without = ' and '.join(f'psd_{psd}' for psd in spots.left_out)
+            without = ' and '.join(f'psd_{psd}' for psd in spots.excluded)
             how = f'without {without}' if without else 'translation from one detector alone'
             text = f'degraded, {how}: {spots.reason}'
         self._outage_log.block(cause, text, time.monotonic())

@@ -117,6 +117,6 @@ def test_the_fitted_silverbox_is_simulated_to_half_a_percent() -> None:
         'gain': {'scale': 0.02988},
     }
     first, last = silverbox.TESTS['multisine']
-    left, share = rmse(plant.y[first:last], plant.run(model, np.array([first]), last - first)[:, 0])
-    assert 1e3 * left < 0.25
+    residual, share = rmse(plant.y[first:last], plant.run(model, np.array([first]), last - first)[:, 0])
+    assert 1e3 * residual < 0.25
     assert share < 0.005

@@ -91,8 +91,8 @@ def test_of_collimation_and_axes_the_stars_show_one_and_it_is_named() -> None:
 
     def bic(*names: str) -> float:
         terms = np.column_stack([telescope.simulate({n: {'size': 1.0}})[0].ravel() for n in names])
-        left = observed - terms @ np.linalg.lstsq(terms, observed, rcond=None)[0]
-        return len(observed) * math.log(float(left @ left)) + math.log(len(observed)) * len(names)
+        residual = observed - terms @ np.linalg.lstsq(terms, observed, rcond=None)[0]
+        return len(observed) * math.log(float(residual @ residual)) + math.log(len(observed)) * len(names)
 
     beside = ('IA', 'IE', 'AN', 'AW', 'HECE4', 'HECE7')
     assert min(bic(*beside, 'NPAE'), bic(*beside, 'CA')) + 1.0 < bic(*beside, 'NPAE', 'CA')

@@ -437,7 +437,7 @@ def test_what_is_reported_of_a_block(rig: Rig) -> None:
     assert (spots.t_ns, spots.index, spots.present, spots.lost) == (49_500_007, 2, 18, 2)
     observed = volts[seq - 40].astype(np.float32).astype(float)
     np.testing.assert_allclose(spots.sums, observed[:, [2, 5]].mean(axis=0), rtol=1e-12)
-    assert (spots.status, spots.reason, spots.findings, spots.left_out) == (BlockStatus.OK, '', (), ())
+    assert (spots.status, spots.reason, spots.findings, spots.excluded) == (BlockStatus.OK, '', (), ())
     assert isinstance(records[-1], SampleBlock)
     assert pipeline.last_spots is spots
     assert pipeline.last_estimate is records[0]

@@ -408,13 +408,13 @@ def test_a_dot_that_was_not_observed_is_not_published(status: BlockStatus) -> No
 def test_of_a_block_without_one_psd_the_others_are_published() -> None:
     """PSD 2 is left out as it is dark: then it has no dot; or as it contradicts the others: then it has."""
     for status, topics in ((BlockStatus.LASER_LOST, [SPOTS[0]]), (BlockStatus.OK, list(SPOTS))):
-        assert [m.topic for m in to_messages(replace(spots(3, status), left_out=(2,)))] == topics
+        assert [m.topic for m in to_messages(replace(spots(3, status), excluded=(2,)))] == topics
 
 
 def test_dots_that_are_no_numbers_are_not_published() -> None:
     lost = replace(spots(3), dots=(1e-3, -2e-3, math.nan, 0.0))
     assert to_messages(lost) == ()
-    assert to_messages(replace(lost, left_out=(2,))) == ()
+    assert to_messages(replace(lost, excluded=(2,))) == ()
 
 
 def test_each_dot_is_published_in_its_own_frame_and_axes() -> None:

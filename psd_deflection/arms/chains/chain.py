@@ -194,10 +194,10 @@ class Chain:
             # One load makes all of them.
             wrong = by_moment.reshape(6, -1) @ np.ones((2 * count, 1))
         else:
-            left = (rest.unexplained @ measured).reshape(count, 3)[:, 1::-1]
+            residual = (rest.unexplained @ measured).reshape(count, 3)[:, 1::-1]
             lengths = np.array([[link.length] for link in self.links])
             doubted = STIFFNESS_DOUBT * (by_moment @ np.ones(2))
-            wrong = np.hstack((doubted, (carried * (UNEXPLAINED * left / lengths)).reshape(6, -1)))
+            wrong = np.hstack((doubted, (carried * (UNEXPLAINED * residual / lengths)).reshape(6, -1)))
         return np.asarray(wrong @ wrong.T, np.float64)
 
     def tips_under(self, force: FloatArray, angles: Sequence[float] | None = None) -> FloatArray:

@@ -133,6 +133,6 @@ class Joiner:
         pose = (1.0 - u) * zero.pose + u * one.pose
         covariance = (1.0 - u) ** 2 * zero.covariance + u**2 * one.covariance
         if after > 1 and zero.t_ns - known[after - 2].t_ns <= neighbours:
-            left_out = 0.5 * u * (1.0 - u) * (one.pose - 2.0 * zero.pose + known[after - 2].pose)
-            covariance = covariance + np.outer(left_out, left_out)
+            curvature = 0.5 * u * (1.0 - u) * (one.pose - 2.0 * zero.pose + known[after - 2].pose)
+            covariance = covariance + np.outer(curvature, curvature)
         return TipDeflection(pose, covariance)

@@ -133,15 +133,15 @@ class JointResponse:
         for j in range(joints.shape[1]):
             step = _step(joints[:, j], follow_error)
             best = int(residual[:, j].argmin())
-            slope, left, size = slopes[best, j], residual[best, j], np.sqrt(squares[best, j] / len(q))
+            slope, smallest, size = slopes[best, j], residual[best, j], np.sqrt(squares[best, j] / len(q))
             moved = np.ptp(joints[:, j]) > 0.5 * follow_error
-            if moved and (abs(slope) > LARGEST_SLOPE or left > UNEXPLAINED * q[:, j].std()):
+            if moved and (abs(slope) > LARGEST_SLOPE or smallest > UNEXPLAINED * q[:, j].std()):
                 self._restart()
                 return None
             if not rests or travel[j] <= 4.0 * SAME:
                 continue
-            alike = residual[:, j] <= 2.0 * left + 0.1 * step
-            half_width = left / size + step / travel[j] + np.abs(slopes[alike, j] - slope).max()
+            alike = residual[:, j] <= 2.0 * smallest + 0.1 * step
+            half_width = smallest / size + step / travel[j] + np.abs(slopes[alike, j] - slope).max()
             if half_width > KNOWN_WITHIN * max(1.0, abs(slope)) or abs(slope) > LARGEST_SLOPE:
                 continue
             before, width = self.slopes[j], self.half_widths[j]

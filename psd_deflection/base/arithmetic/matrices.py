@@ -30,9 +30,9 @@ _MOST_SHAPES = 256
 @cache
 def plan(spec: str) -> tuple[tuple[tuple[tuple[int, ...] | None, tuple[Any, ...]], ...], int]:
     """How each operand is turned so that the summed indices come first; and the number of these."""
-    left, _, out = spec.partition('->')
-    terms = left.split(',')
-    summed = ''.join(dict.fromkeys(c for c in left if c not in out and c != ','))
+    inputs, _, out = spec.partition('->')
+    terms = inputs.split(',')
+    summed = ''.join(dict.fromkeys(c for c in inputs if c not in out and c != ','))
     order = summed + out
     turns = []
     for term in terms:
@@ -128,9 +128,9 @@ def orthogonal(a: FloatArray) -> tuple[FloatArray, FloatArray]:
                 part = float(in_pairs(columns[j] * column))
                 r[j, i] += part
                 column -= part * columns[j]
-        left = sqrt(float(in_pairs(column * column)))
-        r[i, i] = left if left > 1e-13 * size else 0.0
-        column[:] = column / left if left > 1e-13 * size else 0.0
+        residual = sqrt(float(in_pairs(column * column)))
+        r[i, i] = residual if residual > 1e-13 * size else 0.0
+        column[:] = column / residual if residual > 1e-13 * size else 0.0
     return columns.T, r
 
 

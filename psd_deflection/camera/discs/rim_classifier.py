@@ -95,8 +95,8 @@ class RimClassifier:
             raise NoPoseError(Status.DEFOCUSED)
         count = len(rims.level)
         stiff, pull = beforehand(shape, prior)
-        left = normal.squares - float(step @ (2.0 * normal.gradient - normal.hessian @ step))
-        chi_square = max(left / (count - 30), 1e-9)
+        remainder = normal.squares - float(step @ (2.0 * normal.gradient - normal.hessian @ step))
+        chi_square = max(remainder / (count - 30), 1e-9)
         inverse = covariance_of(normal, chi_square, stiff)
         pose = [*range(6), *range(10 + shape.skew.size, len(inverse))]
         *pulls, residual = after(normal, rims, step, inverse[pose])
@@ -211,9 +211,9 @@ def _doubled(normal: Normal, raw: Pixels, blur: FloatArray) -> bool:
         mean = np.bincount(place, observed[of], _DWELL + 1) / np.maximum(count, 1)
         dwell[1:] += end * np.diff(mean[:-1])
     # The two highest places with the lowest between them.
-    left = np.maximum.accumulate(dwell)
+    remainder = np.maximum.accumulate(dwell)
     right = np.maximum.accumulate(dwell[::-1])[::-1]
-    return bool(np.any(dwell[1:-1] < DIP * np.minimum(left[:-2], right[2:]) - 0.015))
+    return bool(np.any(dwell[1:-1] < DIP * np.minimum(remainder[:-2], right[2:]) - 0.015))
 
 
 def _unevenness(z: Pixels, raw: Pixels, rims: Rims, full_scale: float) -> float:

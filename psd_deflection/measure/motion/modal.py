@@ -85,7 +85,7 @@ class BlockGains(NamedTuple):
 
     ``observed`` (A, n, 4): O. ``precision`` (A, K, n, n): S^-1. ``pulled`` (A, K, 4, n): O^T S^-1. ``smoothed``
     (A, K, 4, n): X S^-1. ``information`` (A, K, 4, 4): O^T S^-1 O, of x0. ``kept`` (A, K, 4, 4): x_end for x0, with the
-    samples given. ``left`` (A, K, 4, 4): covariance of x_end if x0 and the samples are known. ``log_size`` (A, K):
+    samples given. ``residual`` (A, K, 4, 4): covariance of x_end if x0 and the samples are known. ``log_size`` (A, K):
     log det S.
     """
 
@@ -95,7 +95,7 @@ class BlockGains(NamedTuple):
     smoothed: FloatArray
     information: FloatArray
     kept: FloatArray
-    left: FloatArray
+    residual: FloatArray
     log_size: FloatArray
 
 

@@ -315,7 +315,7 @@ class ModalFilter:
         carried = self._xp.einsum('akij,akjl->akil', gains.kept, posterior)
         found = after[:, None] + self._xp.einsum('akin,an->aki', gains.smoothed, miss)
         found += self._xp.einsum('akij,akj->aki', carried, score)
-        covariance = self._xp.einsum('akij,aklj->akil', carried, gains.kept) + gains.left
+        covariance = self._xp.einsum('akij,aklj->akil', carried, gains.kept) + gains.residual
         self._x = self._xp.einsum('ak,aki->ai', weights, found)
         apart = found - self._x[:, None]
         total = covariance + apart[..., :, None] * apart[..., None, :]

@@ -14,7 +14,7 @@ import numpy as np
 
 from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.measure.uncertainty.block_fit import Fitted
-from psd_deflection.measure.uncertainty.combinations import Left
+from psd_deflection.measure.uncertainty.combinations import Residual
 from psd_deflection.measure.uncertainty.consistency import UNMEASURED, ConsistencyResult, Unexplained, survival
 from psd_deflection.measure.uncertainty.converter import ConverterSteps, Volts
 from psd_deflection.measure.uncertainty.noise import StreamNoise
@@ -67,7 +67,7 @@ class BlockEstimator:
         self.misfits = 0
         self._use_noise()
 
-    def _model(self) -> tuple[FloatArray | None, Left | None]:
+    def _model(self) -> tuple[FloatArray | None, Residual | None]:
         """Return the slopes at rest and the residuals of the solver's model, None for two PSDs."""
         model = self.full.model
         return (None, None) if model is None else (model.rest_slopes, model.residuals)

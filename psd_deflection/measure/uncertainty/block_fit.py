@@ -225,15 +225,15 @@ class BlockFit:
         covariance = xp.einsum('ac,cd,bd->ab', turn, tone.covariance, turn)
         return _Vibration(covariance, waves, xp.einsum('ask,s->ak', self._full.u, waves[0]))
 
-    def _left_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
+    def _residual_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
         """Covariance (B, C, C), m^2, of what the answers leave of a tone; ``weights`` (B, C, N) of blocks with gaps."""
         xp = self._xp
         if weights is None:
-            left = 1.0 - xp.einsum('kza,ak->za', x, vibration.full)
-            return np.asarray(vibration.covariance * (left[:, :, None] * left[:, None, :]))
+            residual = 1.0 - xp.einsum('kza,ak->za', x, vibration.full)
+            return np.asarray(vibration.covariance * (residual[:, :, None] * residual[:, None, :]))
         kept = xp.einsum('zas,ws->wza', weights, vibration.waves)
-        left, sine = 1.0 - kept[0], kept[1]
-        both = left[:, :, None] * left[:, None, :] + sine[:, :, None] * sine[:, None, :]
+        residual, sine = 1.0 - kept[0], kept[1]
+        both = residual[:, :, None] * residual[:, None, :] + sine[:, :, None] * sine[:, None, :]
         return np.asarray(vibration.covariance * both)
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
@@ -284,17 +284,17 @@ class BlockFit:
             covariance = self._covariance_of(weights)
         misfit = [False] * blocks
         if orders > 1:
-            left = samples - reported
+            free = samples - reported
             # In units of the noise: a chi-square of n - K degrees of freedom.
             squares = xp.sum(z * observed[orders + reported :], 0) - xp.sum(observed[:reported] * c, 0)
-            over = squares > (left + _MISFIT * xp.root(2.0 * left) if left else np.inf)
+            over = squares > (free + _MISFIT * xp.root(2.0 * free) if free else np.inf)
             if np.count_nonzero(over):
                 misfit = [any(row) for row in over.tolist()]
                 rest = z - xp.einsum('sk,kza->sza', terms.q[:, :reported], c)
-                missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / left, 0.0)
+                missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / free, 0.0)
             covariance[:, self._diagonal, self._diagonal] += missed
         for vibration in self._vibrations:
-            covariance += self._left_of(vibration, x, weights)
+            covariance += self._residual_of(vibration, x, weights)
         rows, covariance = self._combinations.back(value, covariance)
         return zip(memories, map(Fitted, map(tuple, rows.tolist()), covariance, misfit), strict=True)
 

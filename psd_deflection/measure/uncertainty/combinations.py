@@ -22,7 +22,7 @@ from psd_deflection.records import FloatArray
 
 _HALF = math.sqrt(0.5)
 
-Left = Callable[[FloatArray], FloatArray]
+Residual = Callable[[FloatArray], FloatArray]
 """What a model of the plate leaves of dots (n, C), m."""
 
 
@@ -94,10 +94,10 @@ class _BaseLine(Combinations):
 class _Several(Combinations):
     """Of more PSDs."""
 
-    def __init__(self, slopes: FloatArray, left: Left | None, xp: Arithmetic) -> None:
+    def __init__(self, slopes: FloatArray, residual: Residual | None, xp: Arithmetic) -> None:
         """``slopes`` (C, unknowns): how each reading goes with each unknown at rest."""
         self._xp = xp
-        self._left = left
+        self._residual = residual
         self.turn = _completed(slopes, xp)
         self.moving = slopes.shape[1]
         self.still = len(slopes)
@@ -113,25 +113,25 @@ class _Several(Combinations):
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        left = dots if self._left is None else self._left(dots)
-        return self._xp.einsum('c,sc->s', self.turn[self.moving], left)
+        residual = dots if self._residual is None else self._residual(dots)
+        return self._xp.einsum('c,sc->s', self.turn[self.moving], residual)
 
 
 def combinations_of(
     centers: FloatArray,
     beams: FloatArray,
     slopes: FloatArray | None = None,
-    left: Left | None = None,
+    residual: Residual | None = None,
     xp: Arithmetic = FIXED,
 ) -> Combinations:
     """Of the PSDs at ``centers`` (P, 2) m under ``beams`` (P, 2) m.
 
     ``slopes`` (2P, unknowns): how the readings of more than two PSDs go with what is solved for, at rest; None: with
-    the motion of a flat plate. ``left``: what the solver's model leaves of the dots; None: to first order.
+    the motion of a flat plate. ``residual``: what the solver's model leaves of the dots; None: to first order.
     """
     if len(centers) == 2:
         return _BaseLine(centers, beams, xp)
-    return _Several(design_matrix(beams) if slopes is None else slopes, left, xp)
+    return _Several(design_matrix(beams) if slopes is None else slopes, residual, xp)
 
 
 def combinations(beams: FloatArray, xp: Arithmetic = FIXED) -> FloatArray:
@@ -152,10 +152,10 @@ def _completed(slopes: FloatArray, xp: Arithmetic) -> FloatArray:
         for _ in range(2):
             for before in rows:
                 row = row - xp.sum(before * row, 0) * before
-        left = xp.root(float(xp.sum(row * row, 0)))
+        residual = xp.root(float(xp.sum(row * row, 0)))
         # Of the unit vectors, those that the rows so far span are left out.
-        if len(rows) < slopes.shape[1] or left > _SPANNED:
-            rows.append(row / left)
+        if len(rows) < slopes.shape[1] or residual > _SPANNED:
+            rows.append(row / residual)
         if len(rows) == count:
             break
     return np.stack(rows)

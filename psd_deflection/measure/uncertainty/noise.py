@@ -31,7 +31,7 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.spectra import lagged_products
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
-from psd_deflection.measure.uncertainty.combinations import Left, combinations_of
+from psd_deflection.measure.uncertainty.combinations import Residual, combinations_of
 from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray
 
@@ -92,11 +92,11 @@ class StreamNoise:
         variances: FloatArray | float,
         steps: FloatArray | float,
         slopes: FloatArray | None = None,
-        left: Left | None = None,
+        residual: Residual | None = None,
         xp: Arithmetic = FIXED,
     ) -> None:
         """``size``: N. ``centers``, ``beams`` (P, 2) m. Of each reading (C,), or of all: ``variances`` m^2 of a sample
-        by the rig file, ``steps`` m of the converter. ``slopes``, ``left``: as :func:`combinations_of` takes them.
+        by the rig file, ``steps`` m of the converter. ``slopes``, ``residual``: as :func:`combinations_of` takes them.
         """
         self._size = size
         self._xp = xp
@@ -106,7 +106,7 @@ class StreamNoise:
         self._steps = np.broadcast_to(steps, (count,))
         # Motion is judged with the largest.
         self._step = float(self._steps.max())
-        self.set_geometry(centers, beams, slopes, left)
+        self.set_geometry(centers, beams, slopes, residual)
         self._mean_of = _mean_weights(size)
         self._q = basis(size, xp)
         self._sums: list[FloatArray] = []
@@ -135,10 +135,10 @@ class StreamNoise:
         self._search = ToneSearch(self._size, SEGMENT_BLOCKS, self._xp)
 
     def set_geometry(
-        self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
+        self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, residual: Residual | None = None
     ) -> None:
         """Use these places, m, from now on."""
-        self._combinations = combinations_of(centers, beams, slopes, left, self._xp)
+        self._combinations = combinations_of(centers, beams, slopes, residual, self._xp)
         self._moving = self._combinations.turn[: self._combinations.moving]
 
     @property
@@ -359,12 +359,12 @@ def _roughness(places: IntArray, series: FloatArray, q: FloatArray, xp: Arithmet
     full = (full - xp.sum(full, 1)[:, None] / count[:, None, None]) * here[:, :, None]
     gram = xp.einsum('bsk,sj->bkj', here[:, :, None] * q, q)
     h = xp.einsum('bsc,sk->bkc', full, q)
-    left = xp.einsum('bsc,bsc->bc', full, full) - xp.einsum(
+    residual = xp.einsum('bsc,bsc->bc', full, full) - xp.einsum(
         'bkc,bkc->bc', h, xp.einsum('bkj,bjc->bkc', inverse(gram), h)
     )
-    if not len(left):
+    if not len(residual):
         return np.zeros(series.shape[1])
-    return np.asarray(np.median(left / (count - orders)[:, None], axis=0))
+    return np.asarray(np.median(residual / (count - orders)[:, None], axis=0))
 
 
 def _autocovariance(

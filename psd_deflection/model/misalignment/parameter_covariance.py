@@ -78,9 +78,9 @@ def _pairs() -> list[tuple[int, int]]:
     """Which products of two make the products of four, each once."""
     second = [(i, j) for i in range(4) for j in range(i, 4)]
     found: dict[tuple[int, ...], tuple[int, int]] = {}
-    for a, left in enumerate(second):
+    for a, row in enumerate(second):
         for b, right in enumerate(second):
-            found.setdefault(tuple(sorted(left + right)), (a, b))
+            found.setdefault(tuple(sorted(row + right)), (a, b))
     return list(found.values())
 
 

@@ -274,9 +274,9 @@ class History:
     def answer(self, wanted: Asked) -> str:
         """:meth:`window` with the marks in it, as JSON."""
         inside = [text for t_ns, text in self.marks if wanted.from_ns <= t_ns <= wanted.to_ns]
-        left_out = max(len(inside) - SENT_MARKS, 0)
-        content = json.dumps({**self.window(wanted).content(), 'marks_left_out': left_out})
-        return f'{content[:-1]}, "marks": [{",".join(inside[left_out:])}]}}'
+        omitted = max(len(inside) - SENT_MARKS, 0)
+        content = json.dumps({**self.window(wanted).content(), 'marks_left_out': omitted})
+        return f'{content[:-1]}, "marks": [{",".join(inside[omitted:])}]}}'
 
     def _columns(self, cells: Cells, at: npt.NDArray[np.int64], length: int) -> dict[str, FloatArray]:
         """``cells`` (m,) put to the places ``at`` (m,) of columns of ``length``."""

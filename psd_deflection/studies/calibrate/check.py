@@ -141,10 +141,10 @@ def overall_p(each: Sequence[float]) -> float:
     return min([1.0, *(len(each) * p for p in each)])
 
 
-def moved_group(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
+def moved_group(name: str, at: IntArray, residual: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
     """Return the shift of a group of parameters, with its evidence against nothing moved."""
     members = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
-    block, score = m[np.ix_(members, members)], left[members]
+    block, score = m[np.ix_(members, members)], residual[members]
     size, vectors = np.linalg.eigh(0.5 * (block + block.T))
     shown = size > _OBSERVED
     along = vectors.T @ score

@@ -146,24 +146,24 @@ def rms_of(values: FloatArray) -> float:
 def fit_modes(stretches: Sequence[Stretch], start: Modes, steps: int = 100) -> RingFit:
     """Return the least-squares fit of the modes to all stretches, from ``start`` on."""
 
-    def left(x: FloatArray) -> FloatArray:
+    def residual(x: FloatArray) -> FloatArray:
         modes = [(float(f), float(z)) for f, z in x.reshape(-1, 2)]
         return np.concatenate([s.solved(modes)[0] for s in stretches])
 
     x0 = np.array(start, dtype=np.float64).ravel()
     scale = np.column_stack([x0[0::2], np.full(len(start), 0.01)]).ravel()
-    size = max(rms_of(left(x0)), 1e-300)
+    size = max(rms_of(residual(x0)), 1e-300)
     low = np.column_stack([0.7 * x0[0::2], np.full(len(start), LEAST_DAMPING)]).ravel()
     high = np.column_stack([1.4 * x0[0::2], np.full(len(start), MOST_DAMPING)]).ravel()
 
     def scaled(x: FloatArray) -> FloatArray:
-        return left(x) / size
+        return residual(x) / size
 
     x0 = np.clip(x0, low * 1.001, high * 0.999)
     solution = least_squares(scaled, x0, x_scale=scale, bounds=(low, high), xtol=1e-13, max_nfev=steps)
     jacobian = np.asarray(solution.jac, dtype=np.float64) * size
     covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
-    return RingFit([(float(f), float(z)) for f, z in solution.x.reshape(-1, 2)], left(solution.x), covariance)
+    return RingFit([(float(f), float(z)) for f, z in solution.x.reshape(-1, 2)], residual(solution.x), covariance)
 
 
 def split_mode(stretches: Sequence[Stretch], modes: Modes) -> RingFit:

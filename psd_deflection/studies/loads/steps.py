@@ -161,7 +161,7 @@ def time_of_step(
     values = part[there] - basis @ (basis.T @ part[there])
     filters = [mode_coefficients(f, ratio, period) for f, ratio in link_modes(rig)]
 
-    def left(x: FloatArray) -> float:
+    def residual(x: FloatArray) -> float:
         pushed = applied(t, float(x[0]), abs(float(x[1])), period)
         moved = np.column_stack([Filter(c)(pushed) for c in filters])[there]
         moved = moved - basis @ (basis.T @ moved)
@@ -170,8 +170,8 @@ def time_of_step(
 
     middle = step.at * period
     around = min(0.15 + step.lost * period, MOST_AROUND_S)
-    sudden = best_time(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
-    slow = best_time(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
+    sudden = best_time(residual, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
+    slow = best_time(residual, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
     start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
     return start, abs(took)
 

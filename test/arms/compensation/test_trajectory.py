@@ -263,7 +263,7 @@ def test_shapers_in_series_end_both_modes() -> None:
 
 @pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
 def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
-    assert shapers.left(shaper(kind, wrong * shapers.FREQUENCY, shapers.RATIO)) < 0.05
+    assert shapers.residual(shaper(kind, wrong * shapers.FREQUENCY, shapers.RATIO)) < 0.05
 
 
 @pytest.mark.parametrize('orders', [1, 2, 3])

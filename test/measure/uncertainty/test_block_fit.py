@@ -180,11 +180,11 @@ class Dense:
             weights[a, slots] = w
             value[a] = w @ z[a]
             more[a] = float((self.middle - w @ q)[1:] ** 2 @ tau[1:])
-            left = z[a] - z[a].mean() - q[:, :reported] @ c
+            residual = z[a] - z[a].mean() - q[:, :reported] @ c
             free = n - reported
-            if free > 0 and left @ precision @ left > free + 5.0 * (2.0 * free) ** 0.5:
+            if free > 0 and residual @ precision @ residual > free + 5.0 * (2.0 * free) ** 0.5:
                 misfit = True
-                more[a] += float(left @ left) / free
+                more[a] += float(residual @ residual) / free
         covariance = np.einsum('as,abst,bt->ab', weights, self.noise_covariance, weights) + np.diag(more)
         dots, noise_covariance = self.of.back(value[None], covariance[None])
         return tuple(dots[0].tolist()), noise_covariance[0], misfit
@@ -251,12 +251,12 @@ def _middle_of(column: FloatArray) -> float:
 def test_a_block_misfits_from_five_standard_deviations_of_its_squares_on(share: float, misfit: bool) -> None:
     """Of 20 samples and 5 orders 15 degrees of freedom: 15 + 5 sqrt(30). What is left is added as an error."""
     fit, q = fitter(), basis(SIZE)
-    left = (ALL - 9.5) ** 5.0 - q @ (q.T @ (ALL - 9.5) ** 5.0)
-    left *= SIGMA * (share * (15.0 + 5.0 * 30.0**0.5)) ** 0.5 / float(np.linalg.norm(left))
-    got = fit.fit(ALL, np.outer(left, combinations(PLACES)[0]))
+    residual = (ALL - 9.5) ** 5.0 - q @ (q.T @ (ALL - 9.5) ** 5.0)
+    residual *= SIGMA * (share * (15.0 + 5.0 * 30.0**0.5)) ** 0.5 / float(np.linalg.norm(residual))
+    got = fit.fit(ALL, np.outer(residual, combinations(PLACES)[0]))
     assert got.misfit == misfit
     own = float(combinations(PLACES)[0] @ got.covariance @ combinations(PLACES)[0])
-    assert own == pytest.approx(SIGMA**2 / 20.0 + (float(left @ left) / 15.0 if misfit else 0.0), rel=1e-2)
+    assert own == pytest.approx(SIGMA**2 / 20.0 + (float(residual @ residual) / 15.0 if misfit else 0.0), rel=1e-2)
 
 
 # ---- motion that goes on alike

@@ -27,7 +27,7 @@ from psd_deflection.measure.uncertainty.consistency import (
 from psd_deflection.records import FloatArray
 
 
-def left_over(readings: FloatArray, slopes: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
+def residual_of(readings: FloatArray, slopes: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
     """Unknowns of the least squares with this covariance, and its chi-square."""
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     unknowns = np.linalg.lstsq(root @ slopes, root @ readings, rcond=None)[0]
@@ -53,11 +53,11 @@ def test_excess_of_the_base_line_is_that_of_least_squares(seed: int) -> None:
     readings = np.random.default_rng(seed).normal(size=4) * 5e-6
     residual = readings - DESIGN @ np.linalg.lstsq(DESIGN, readings, rcond=None)[0]
     got = two().update(BaseLineExcess(REST, tuple(residual.tolist()), COVARIANCE), 1.0, None)
-    assert got.chi_square == pytest.approx(left_over(readings, DESIGN, COVARIANCE)[1], rel=1e-9)
+    assert got.chi_square == pytest.approx(residual_of(readings, DESIGN, COVARIANCE)[1], rel=1e-9)
     # Of each reading the error that alone explains all: with it taken off nothing is left.
     for i, error in enumerate(got.errors):
         true = readings - error * np.eye(4)[i]
-        assert left_over(true, DESIGN, COVARIANCE)[1] == pytest.approx(0.0, abs=1e-9)
+        assert residual_of(true, DESIGN, COVARIANCE)[1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_readings_with_next_to_no_part_in_the_base_line_have_no_error() -> None:
@@ -131,7 +131,7 @@ def with_error(psd: int, error: tuple[float, float], chi_square: float | None = 
     wrong = np.zeros(2 * PSDS)
     wrong[2 * psd - 2 : 2 * psd] = error
     if chi_square is not None:
-        wrong *= (chi_square / left_over(wrong, SLOPES, FULL)[1]) ** 0.5
+        wrong *= (chi_square / residual_of(wrong, SLOPES, FULL)[1]) ** 0.5
     return SLOPES @ [1e-5, -2e-5, 3e-5] + wrong
 
 
@@ -156,11 +156,11 @@ def check(
 def test_the_error_of_one_psd_alone_is_that_of_least_squares_with_two_unknowns_more(psd: int) -> None:
     readings = with_error(psd, (2e-4, -3e-4)) + 1e-6 * np.random.default_rng(psd).normal(size=2 * PSDS)
     got = check(four(), readings)
-    assert got.chi_square == pytest.approx(left_over(readings, SLOPES, FULL)[1], rel=1e-9)
+    assert got.chi_square == pytest.approx(residual_of(readings, SLOPES, FULL)[1], rel=1e-9)
     assert got.freedom == 5
     for other in range(PSDS):
         more = np.eye(2 * PSDS)[:, 2 * other : 2 * other + 2]
-        found, _ = left_over(readings, np.column_stack((SLOPES, more)), FULL)
+        found, _ = residual_of(readings, np.column_stack((SLOPES, more)), FULL)
         np.testing.assert_allclose(got.errors[2 * other : 2 * other + 2], found[-2:], rtol=1e-6)
 
 
@@ -173,7 +173,7 @@ def test_with_one_or_two_degrees_of_freedom_each_reading_has_its_own_error(unkno
     assert got.freedom == 2 * PSDS - unknowns
     shows = unexplained(slopes).diagonal()
     for i, error in enumerate(got.errors):
-        found, _ = left_over(readings, np.column_stack((slopes, np.eye(2 * PSDS)[:, i])), FULL)
+        found, _ = residual_of(readings, np.column_stack((slopes, np.eye(2 * PSDS)[:, i])), FULL)
         # A reading that hardly shows cannot be checked.
         assert error == pytest.approx(found[-1] if shows[i] > 4e-4 * shows.max() else 0.0, rel=1e-6)
     assert sum(error == 0.0 for error in got.errors) == (unknowns == 7)

@@ -193,8 +193,8 @@ def test_a_recording_with_lasers_on_does_not_report_light_from_gains() -> None:
     names = ('psd_1.gain_x', 'psd_1.gain_y')
     at = [*(INDEX[name] for name in names), ZERO, ZERO + 1]
     slopes = by_parameters(p, pose, 0.585)[:2, at].transpose(0, 2, 1).reshape(-1, 4)
-    left = by_level.ravel() - slopes @ np.linalg.lstsq(slopes, by_level.ravel(), rcond=None)[0]
-    assert np.abs(left).max() < 0.01 * np.abs(by_level).max()
+    residual = by_level.ravel() - slopes @ np.linalg.lstsq(slopes, by_level.ravel(), rcond=None)[0]
+    assert np.abs(residual).max() < 0.01 * np.abs(by_level).max()
 
 
 def lit_poses(rig: Rig, light: Any, seed: int) -> float:

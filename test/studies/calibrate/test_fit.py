@@ -40,8 +40,8 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
     found = pose_of_readings(dots, sd**2, p, length)
 
     def misfit(pose: FloatArray, row: int) -> float:
-        left = (dots[row] - misaligned.dots(misaligned.nominal(), pose[None])[0]) / sd[row]
-        return float(left @ left)
+        residual = (dots[row] - misaligned.dots(misaligned.nominal(), pose[None])[0]) / sd[row]
+        return float(residual @ residual)
 
     for row, pose in enumerate(found):
 

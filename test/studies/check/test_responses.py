@@ -69,8 +69,8 @@ def test_slopes_are_least_squares_and_memory_widens_them() -> None:
     wanted, squares, _, _ = np.linalg.lstsq(design, values, rcond=None)
     assert slopes == pytest.approx(wanted, rel=1e-6)
     assert covariance == pytest.approx(np.linalg.inv(design.T @ design), rel=1e-6)
-    left = values - design @ wanted
-    memory = [float(r[1:] @ r[:-1] / (r @ r)) for r in left.T]
+    residual = values - design @ wanted
+    memory = [float(r[1:] @ r[:-1] / (r @ r)) for r in residual.T]
     widened = [(1.0 + max(m, 0.0)) / (1.0 - max(m, 0.0)) for m in memory]
     assert variance == pytest.approx(squares / (200 - 6) * widened, rel=1e-6)
     # Memory counts up to 0.98: that of a slow wave is more.

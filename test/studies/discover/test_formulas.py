@@ -203,8 +203,8 @@ def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:
     old = rng.standard_normal((15, 3))
     both = np.vstack((slopes[1], old))
     target = np.concatenate((rows[0] - rows[1], np.zeros(15)))
-    left = target - both @ np.linalg.lstsq(both, target, rcond=None)[0]
-    assert observed.separation(0, 1, old.T @ old) == pytest.approx(float(left @ left), rel=1e-9)
+    residual = target - both @ np.linalg.lstsq(both, target, rcond=None)[0]
+    assert observed.separation(0, 1, old.T @ old) == pytest.approx(float(residual @ residual), rel=1e-9)
     # One without parameters cannot adapt.
     assert observed.separation(1, 0, np.zeros((0, 0))) == pytest.approx(observed.apart[0, 1])
     again, _, _ = some_shown(rng, 3.0)
@@ -409,9 +409,9 @@ def test_of_many_lines_the_strongest_four_are_stripped() -> None:
     t = np.arange(4000) * 1e-3
     lines = [np.sin(2 * np.pi * f * t + f) * s for f, s in ((50, 9.0), (100, 8.0), (150, 7.0), (200, 6.0), (250, 5.0))]
     noise = rng.standard_normal(4000)
-    left = strip_lines(noise + sum(lines[:4]) + 3.0)
-    assert left.std() == pytest.approx(1.0, abs=0.05)
-    assert left.mean() == pytest.approx(0.0, abs=1e-9)
+    residual = strip_lines(noise + sum(lines[:4]) + 3.0)
+    assert residual.std() == pytest.approx(1.0, abs=0.05)
+    assert residual.mean() == pytest.approx(0.0, abs=1e-9)
     # A line leaves nothing at its frequency and the next three on either side.
     spectrum = np.abs(np.fft.rfft(strip_lines(noise + lines[0], 1)))
     assert spectrum[[*range(1, 197), *range(204, 2000)]].min() > 1e-6

@@ -109,10 +109,10 @@ def test_two_models_are_separated_by_what_no_sizes_of_one_explain() -> None:
     slopes = rng.standard_normal((30, 2))
     slopes[:, 1] = slopes[:, 0] + 1e-3 * slopes[:, 1]
     apart = slopes @ [3.0, 50.0] + rng.standard_normal(30)
-    left = apart - slopes @ np.linalg.lstsq(slopes, apart, rcond=None)[0]
+    residual = apart - slopes @ np.linalg.lstsq(slopes, apart, rcond=None)[0]
     pull = [[np.empty(0), slopes.T @ apart], [np.empty(0), np.zeros(2)]]
     shown = ModelSums(np.full((2, 2), apart @ apart), pull, [np.empty((0, 0)), slopes.T @ slopes], 1.0)
-    assert shown.separation(0, 1, np.zeros((2, 2))) == pytest.approx(left @ left, rel=1e-6)
+    assert shown.separation(0, 1, np.zeros((2, 2))) == pytest.approx(residual @ residual, rel=1e-6)
 
 
 # Laws.

@@ -60,8 +60,8 @@ def forward_backward(plant: Small) -> Model:
         return np.asarray(np.linalg.lstsq(table[:, sorted(terms)], y, rcond=None)[0])
 
     def bic(terms: frozenset[int]) -> float:
-        left = y - table[:, sorted(terms)] @ sizes(terms)
-        return float(len(y) * np.log(left @ left) + len(terms) * np.log(len(y)))
+        residual = y - table[:, sorted(terms)] @ sizes(terms)
+        return float(len(y) * np.log(residual @ residual) + len(terms) * np.log(len(y)))
 
     while (best := min((chosen ^ {j} for j in range(TERMS)), key=bic)) and bic(best) < bic(chosen):
         chosen = best

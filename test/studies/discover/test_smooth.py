@@ -71,8 +71,8 @@ def test_a_smooth_remainder_is_one_function_of_the_variable_that_it_follows() ->
     assert found.remainder.function is not None
     # It is the waves, but for what offset and slope take.
     free = np.column_stack([np.ones(30), plant.along, np.sin(9.0 * plant.along)])
-    left = found.remainder.function.tables[0][0]
-    assert np.std(left - free @ np.linalg.lstsq(free, left, rcond=None)[0]) < NOISE
+    residual = found.remainder.function.tables[0][0]
+    assert np.std(residual - free @ np.linalg.lstsq(free, residual, rcond=None)[0]) < NOISE
     assert 'a smooth function of along' in found.report()
 
 
@@ -95,14 +95,14 @@ def test_a_reading_is_predicted_without_itself() -> None:
     apart = {'x': (x[:, None] - x) ** 2 / np.var(x)}
     there = np.ones(24, dtype=bool)
 
-    def left(readings: FloatArray) -> FloatArray:
+    def residual(readings: FloatArray) -> FloatArray:
         remains = Remainders(readings, np.zeros(24, dtype=np.int64), np.ones((24, 1)), np.arange(24), apart)
         return unseen_residual(remains, ('x',), np.log([[0.1, 1.0, 0.5]]), there)
 
     moved = values.copy()
     moved[7] += 0.5
-    assert left(moved)[7] - left(values)[7] == pytest.approx(0.5, abs=1e-6)
-    assert float(np.std(left(values))) < 0.3
+    assert residual(moved)[7] - residual(values)[7] == pytest.approx(0.5, abs=1e-6)
+    assert float(np.std(residual(values))) < 0.3
 
 
 def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
@@ -116,10 +116,10 @@ def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     free = np.column_stack([np.ones(n), x])
     apart = {'x': (x[:, None] - x) ** 2 / np.var(x)}
     remains = Remainders(values, np.zeros(n, dtype=np.int64), free, np.arange(n), apart)
-    left = unseen_residual(remains, ('x',), np.log([[noise, size, length]]), np.ones(n, dtype=bool), shaped=True)
+    residual = unseen_residual(remains, ('x',), np.log([[noise, size, length]]), np.ones(n, dtype=bool), shaped=True)
     inverse = np.linalg.inv(size**2 * np.exp(-0.5 * apart['x'] / length**2) + noise**2 * np.eye(n))
     p = inverse - inverse @ free @ np.linalg.inv(free.T @ inverse @ free) @ free.T @ inverse
-    np.testing.assert_allclose(left, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(residual, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
 
 
 def test_the_gap_with_given_shapes_is_reported_beside_the_other() -> None:

@@ -88,9 +88,9 @@ def test_what_a_stretch_leaves_is_that_of_dense_least_squares() -> None:
     modes = [(16.0, 0.02), (40.0, 0.05)]
     a = columns(s.t, modes)
     terms = np.linalg.lstsq(a, s.y, rcond=None)[0]
-    left, found = s.solved(modes)
+    residual, found = s.solved(modes)
     np.testing.assert_allclose(found, terms, rtol=1e-7)
-    np.testing.assert_allclose(left, s.y - a @ terms, atol=1e-12)
+    np.testing.assert_allclose(residual, s.y - a @ terms, atol=1e-12)
     assert s.loud(modes) == pytest.approx(max(math.hypot(*terms[2:4]), math.hypot(*terms[4:6])), rel=1e-7)
     assert s.loud(modes[:1]) > 0.0
     t = times(600)
@@ -130,8 +130,8 @@ def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
     jacobian[:, :2] = np.vstack(slopes)
     expected = np.linalg.inv(jacobian.T @ jacobian)[:2, :2]
     np.testing.assert_allclose(fit.covariance.diagonal(), expected.diagonal(), rtol=0.02)
-    left = np.concatenate([s.solved(fit.modes)[0] for s in (stretch(y) for y in both)])
-    np.testing.assert_allclose(fit.residual, left)
+    residual = np.concatenate([s.solved(fit.modes)[0] for s in (stretch(y) for y in both)])
+    np.testing.assert_allclose(fit.residual, residual)
     # Least squares: along its slopes nothing is left to gain.
     along = jacobian[:, :2] / np.linalg.norm(jacobian[:, :2], axis=0)
     assert np.max(np.abs(along.T @ fit.residual)) < 1e-3 * np.linalg.norm(fit.residual)
@@ -169,9 +169,9 @@ def test_a_pair_beside_a_mode_is_hinted_at(apart: float, observed: bool, damping
     samples = [ring(t, places[0], of_pair, size) + ring(t, places[1], of_pair, 1e-3, 1.0) for size in (1e-3, -5e-4)]
     both = [stretch(y) for y in samples]
     modes = [(50.0, 0.02), (16.0, damping)]
-    left = np.concatenate([s.solved(modes)[0] for s in both])
-    fit = RingFit(modes, left, np.eye(4))
-    squares = float(np.sum(left**2))
+    residual = np.concatenate([s.solved(modes)[0] for s in both])
+    fit = RingFit(modes, residual, np.eye(4))
+    squares = float(np.sum(residual**2))
     assert hints_at_pair(both, fit, 0.99999999 * squares) is observed
     assert not hints_at_pair(both, fit, 1.0001 * squares)
 
@@ -192,8 +192,8 @@ def test_how_loud_the_ringing_is_is_reported_by_dense_least_squares() -> None:
         y = samples[first : first + window]
         y = y - line @ np.linalg.lstsq(line, y, rcond=None)[0]
         assert loud == pytest.approx(math.sqrt(2.0 * np.mean(y**2)), rel=1e-9)
-        left = y - shapes @ np.linalg.lstsq(shapes, y, rcond=1e-6)[0]
-        assert rest == pytest.approx(math.sqrt(np.mean(left**2)), rel=1e-6)
+        residual = y - shapes @ np.linalg.lstsq(shapes, y, rcond=1e-6)[0]
+        assert rest == pytest.approx(math.sqrt(np.mean(residual**2)), rel=1e-6)
 
 
 def test_windows_to_begin_with_ring_do_not_overlap_by_half_and_are_there() -> None:
@@ -234,17 +234,17 @@ def test_half_a_window_at_the_end_fits_by_itself(early: bool) -> None:
     samples[order][:-50] = 1e-3 * (np.arange(250) % 2)
     s = stretch(samples)
     for size, fits in ((2.36e-6, True), (2.39e-6, False)):
-        left = np.zeros(300)
-        left[order][-50:] = size
-        left[order][:-50] = 1.0
-        assert ends_well(s, left, 100, 1e-6, early) is fits
-        assert early or ends_well(s, left, 100, 1e-6) is fits
-        assert not ends_well(s, left, 100, 1e-6, not early)
-    left = np.zeros(300)
-    left[order][-50] = 2.36e-6 * math.sqrt(50.0)
-    assert ends_well(s, left, 100, 1e-6, early)
-    left[order][-50] *= 1.02
-    assert not ends_well(s, left, 100, 1e-6, early)
+        residual = np.zeros(300)
+        residual[order][-50:] = size
+        residual[order][:-50] = 1.0
+        assert ends_well(s, residual, 100, 1e-6, early) is fits
+        assert early or ends_well(s, residual, 100, 1e-6) is fits
+        assert not ends_well(s, residual, 100, 1e-6, not early)
+    residual = np.zeros(300)
+    residual[order][-50] = 2.36e-6 * math.sqrt(50.0)
+    assert ends_well(s, residual, 100, 1e-6, early)
+    residual[order][-50] *= 1.02
+    assert not ends_well(s, residual, 100, 1e-6, early)
 
 
 def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
@@ -520,8 +520,8 @@ def trimmed(
     """What is kept of pieces of so many samples, a quarter of a period, that leave so much."""
     samples = np.zeros(3000)
     s = Stretch(samples, 100, 100 + piece * len(scatter), RATE)
-    left = np.repeat(scatter, piece) * np.resize(pattern, piece * len(scatter))
-    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    residual = np.repeat(scatter, piece) * np.resize(pattern, piece * len(scatter))
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
     kept = trim(s, samples, RATE, [(RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
     return None if kept is None else (kept.first, kept.last)
 
@@ -550,9 +550,9 @@ def test_however_errors_remember_a_fortieth_of_the_samples_counts(monkeypatch: p
 def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = np.zeros(200)
     s = Stretch(samples, 0, 200, RATE)
-    left = np.ones(200) * np.resize((1.0, -1.0), 200)
-    left[197] = 50.0
-    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    residual = np.ones(200) * np.resize((1.0, -1.0), 200)
+    residual[197] = 50.0
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
     kept = trim(s, samples, RATE, [(128.0, 0.02)])
     assert kept is not None
     assert (kept.first, kept.last) == (0, 196)
@@ -561,10 +561,10 @@ def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch)
 def test_a_piece_of_one_sample_counts_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = np.zeros(400)
     s = Stretch(samples, 10, 10 + 16 * 20 + 1, RATE)
-    left = np.resize((1.0, -1.0), 321)
-    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    residual = np.resize((1.0, -1.0), 321)
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
     for size, last in ((1.65, 331), (1.75, 330)):
-        left[-1] = size
+        residual[-1] = size
         kept = trim(s, samples, RATE, [(16.0, 0.02)])
         assert kept is not None
         assert (kept.first, kept.last) == (10, last)
@@ -614,10 +614,10 @@ def test_the_variance_at_a_mode_is_that_of_white_noise_of_its_density(
 ) -> None:
     """Within 30 % of it, or five lines; the modes there have taken a line each, and another each stretch."""
     rng = np.random.default_rng(13)
-    left = np.cumsum(rng.normal(size=n))
+    residual = np.cumsum(rng.normal(size=n))
     modes = [(frequency * 1.01, 0.02), *[(frequency * 0.72, 0.02)] * (close - 1), (frequency * 1.31, 0.02)]
-    fit = RingFit(modes, left, np.eye(2 * len(modes)))
-    f, p = periodogram(left, rate)
+    fit = RingFit(modes, residual, np.eye(2 * len(modes)))
+    f, p = periodogram(residual, rate)
     near = [v for k, v in zip(f, p, strict=True) if abs(k - frequency) < half_width]
     assert len(near) == count
     s = stretch(np.zeros(20))
@@ -699,7 +699,7 @@ def test_the_stretches_are_sought_again_with_the_mode_that_was_missing(
     """Three times at most, as long as there are more samples in them. Windows are of the first mode."""
     samples = np.zeros(3000)
     fit = RingFit([(16.0, 0.02), (50.0, 0.03)], np.full(1000, 2e-6), np.eye(4))
-    left = list(scans)
+    residual = list(scans)
     settled: list[int] = []
 
     def settle(
@@ -711,7 +711,7 @@ def test_the_stretches_are_sought_again_with_the_mode_that_was_missing(
     def scan(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[Stretch]:
         assert (modes, window, hop) == (fit.modes, 384, 32)
         assert level == pytest.approx(2e-6)
-        return [Stretch(samples, 100, 100 + left.pop(0), RATE)]
+        return [Stretch(samples, 100, 100 + residual.pop(0), RATE)]
 
     monkeypatch.setattr(module, 'fit_trimmed', settle)
     monkeypatch.setattr(module, 'scan_windows', scan)
@@ -720,9 +720,9 @@ def test_the_stretches_are_sought_again_with_the_mode_that_was_missing(
     assert settled == [500, *lengths]
     assert found.stretches == (((100, 100 + lengths[-1]),) if lengths else ((300, 800),))
     # With the modes that were known nothing is sought again.
-    left[:] = [999]
+    residual[:] = [999]
     fit_ring_downs(samples, RATE, fit.modes, [Stretch(samples, 300, 800, RATE)])
-    assert left == [999]
+    assert residual == [999]
 
 
 def test_ends_that_reach_into_a_blow_are_cut_before_the_fit() -> None:

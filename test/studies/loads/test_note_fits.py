@@ -125,14 +125,14 @@ def test_steps_every_6_ms_and_ramps_below_half_are_fitted(
     asked: list[tuple[list[tuple[float, float]], float]] = []
     slowly = [0.49]
 
-    def least(left: object, starts: list[tuple[float, float]], reach: float) -> tuple[float, tuple[float, float]]:
+    def least(residual: object, starts: list[tuple[float, float]], reach: float) -> tuple[float, tuple[float, float]]:
         asked.append((starts, reach))
         return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slowly[0], (2.5, -1.1))
 
     monkeypatch.setattr(steps_module, 'best_time', least)
     step = steps_module.DotStep(3000.0, 1e-4, 2800, 3200)
-    for left, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
-        slowly[0] = left
+    for residual, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
+        slowly[0] = residual
         assert steps_module.time_of_step(RIG, moved_by(3.0, 0.0), step, (0.0, 6000.0), 1e-3) == found
     (sudden, by), (ramps, seconds) = asked[:2]
     assert [at for at, _ in sudden] == pytest.approx([2.85 + 0.006 * i for i in range(51)])
@@ -174,15 +174,15 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     there = np.asarray(np.isfinite(dots).all(axis=1))
     rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
     with np.errstate(invalid='raise', divide='raise'):
-        left, means = annotated_times.residual_of_dots(RIG, dots, loads)
-    assert left == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
+        residual, means = annotated_times.residual_of_dots(RIG, dots, loads)
+    assert residual == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
     assert means.shape == dots.shape
     for first in range(0, 1010, 20):
         part = rest[first : first + 20]
         wanted = np.nanmean(part, axis=0) if np.isfinite(part).any() else np.full(4, np.nan)
         assert means[first : first + 20] == pytest.approx(np.tile(wanted, (len(part), 1)), rel=1e-4, nan_ok=True)
     # A millionth of the loads moves the dots alike.
-    assert annotated_times.residual_of_dots(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
+    assert annotated_times.residual_of_dots(RIG, dots, 1e-6 * loads)[0] == pytest.approx(residual, rel=1e-6)
     # And one axis that is never loaded does nothing.
     loads[:, 1] = 0.0
     design[:, 3] = 0.0
@@ -265,7 +265,7 @@ def with_pieces(
     monkeypatch: pytest.MonkeyPatch,
     steps: list[steps_module.DotStep],
     fitted: dict[float, tuple[float, float]],
-    left: tuple[float, float] = (1.0, 100.0),
+    residual: tuple[float, float] = (1.0, 100.0),
 ) -> list[tuple[float, float]]:
     """Steps, their fitted times and what mended and noted loads leave; between which samples a time was fitted."""
     between: list[tuple[float, float]] = []
@@ -276,7 +276,7 @@ def with_pieces(
         between.append(edges)
         return fitted[step.at]
 
-    leaves = iter([left[0], left[1]] * 9)
+    leaves = iter([residual[0], residual[1]] * 9)
     monkeypatch.setattr(annotated_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(annotated_times, 'time_of_step', fit)
@@ -378,8 +378,8 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
     assert correct_loads(RIG, dots, late) is None
     fitted.update({3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
-    for left, reported_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
-        with_pieces(monkeypatch, steps, fitted, left)
+    for residual, reported_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
+        with_pieces(monkeypatch, steps, fitted, residual)
         assert (correct_loads(RIG, dots, late) is not None) == reported_late
 
 

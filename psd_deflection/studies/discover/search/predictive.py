@@ -394,8 +394,8 @@ def _reached(line: _Line, x: FloatArray, sizes: FloatArray) -> tuple[FloatArray,
     low, high = (np.array([getattr(p, n) for p in library.places]) for n in ('low', 'high'))
     wanted = off + sizes / line.lengths
     moved = np.linalg.norm(line.columns * sizes, axis=0)
-    left = float(np.linalg.norm(line.target - line.columns @ sizes))
-    small = (moved < NEGLIGIBLE * max(left, 1e-300)) & ~line.named
+    norm = float(np.linalg.norm(line.target - line.columns @ sizes))
+    small = (moved < NEGLIGIBLE * max(norm, 1e-300)) & ~line.named
     wanted = np.clip(np.where(small, off, wanted), low, high)
     loss = ws.loss(library.residual(x)[0])
     for share in (1.0, 0.5, 0.25):
