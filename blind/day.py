@@ -35,7 +35,7 @@ LOADS_IN_TURN = ((0, -20, 0), (0, -50, 0), (0, -50, -29.25), (30, 0, 0), (20, -4
 FIRST_S, EACH_S = 16.0, 12.0
 """On a slow machine a command takes seconds: the zero must be taken before the first weight hangs."""
 NEAR_S = 0.05
-"""By that a time may be told otherwise."""
+"""By that a time may be determined otherwise."""
 HELLO = {'serial': 'BLIND-1', 'firmware': 'day', 'sample_rate_hz': RATE, 'volts_per_count': LSB}
 
 

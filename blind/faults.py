@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             for name, load in (('sidebar', (0.0, -force, -0.585 * force)), ('link', (0.0, -force, 0.0))):
                 worst, named = fault(kind, channel, load)
                 print(
-                    f'| {kind} {channel} | {force:g} N, {name} | {worst:.1f} | {named or "cannot be told"} |',
+                    f'| {kind} {channel} | {force:g} N, {name} | {worst:.1f} | {named or "cannot be determined"} |',
                     flush=True,
                 )
     return 0

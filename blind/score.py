@@ -371,7 +371,9 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
 
 
 def _names_none(r: Row) -> bool:
-    """Return whether an effect is named that is none: neither it nor one that cannot be told from it is hidden."""
+    """Return whether an effect is named that is none: neither it nor one that cannot be distinguished from it is
+    hidden.
+    """
     return any(not any(t['name'] in s for t in r.truth) for s in r.sets)
 
 

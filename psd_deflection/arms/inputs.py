@@ -96,7 +96,7 @@ class KnownJoints:
                 )
 
     def measured(self, now: float) -> dict[str, MeasuredJoint]:
-        """The joints that were told of late."""
+        """The joints that were reported recently."""
         return {
             name: reported.measured() for name, reported in self._reported.items() if now - reported.last[1] <= KNOWN_S
         }

@@ -102,7 +102,7 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
             f'{len(points)} images show the board, at least {LEAST_IMAGES} are needed, tilted in all directions{why}'
         )
     cv2 = opencv()
-    # Without the third radial term: it is only told from the second by what lies in the corners of the image.
+    # Without the third radial term: it is only distinguished from the second by what lies in the corners of the image.
     rms, matrix, distortion, _, _, deviation, _, _ = cv2.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv2.CALIB_FIX_K3
     )

@@ -260,7 +260,7 @@ class Estimation:
     def _solve_consistent(
         self, block: ValidBlock, dots: Dots, variances: tuple[float, ...], readings: BlockReadings
     ) -> BlockSolution:
-        """Solve ``readings``, without the PSD that contradicts the others if it can be told.
+        """Solve ``readings``, without the PSD that contradicts the others if it can be determined.
 
         ``dots`` (2P,) m to publish, ``variances`` (2P,) m^2 of all PSDs.
         """

@@ -294,7 +294,7 @@ class Pipeline:
     def load(self, load: AppliedLoad) -> ParameterChange | None:
         """Tell the filter of the motion a known load; None if there is no filter, or if it holds already.
 
-        What the load does before the next block is not foretold.
+        What the load does before the next block is not predicted.
         """
         if self.motion_filter is None or not self.motion_filter.is_new(load):
             return None

@@ -303,7 +303,7 @@ class EstimatorConfig:
     filter_ahead: float = parameter(
         0.0,
         's',
-        'the filter foretells the motion so long after the last sample: the transport delay of who uses it',
+        'the filter predicts the motion so long after the last sample: the transport delay of who uses it',
         minimum=0.0,
         maximum=1.0,
     )

@@ -71,9 +71,9 @@ NODE_NAME = 'compensator'
 ENABLE = '~/enable'
 PERIOD_S = 0.01
 REPORTED_S = 0.02
-"""Changes of state that are shorter are not told, s."""
+"""Changes of state that are shorter are not reported, s."""
 NEWS = 6
-"""Changes to one state that are told one by one, before they are counted and told together."""
+"""Changes to one state that are reported one by one, before they are counted and told together."""
 LOOK_S = 1.0
 """Time in which DDS finds another node that commands the robot, before anything is sent, s."""
 RELEASE_S = 10.0

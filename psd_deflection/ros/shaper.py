@@ -37,7 +37,7 @@ from psd_deflection.run.rate_limited_log import RateLimitedLog
 
 NODE_NAME = 'shaper'
 NEWS = 6
-"""Rejections that are told one by one, before they are counted and told together."""
+"""Rejections that are reported one by one, before they are counted and told together."""
 LONGEST = 200
 """Characters of a rejection, in which a stranger's words may be."""
 

@@ -207,7 +207,7 @@ class HealthReporter:
             ('base accelerations, rejected', str(self._session.rejected[ACCELERATION])),
             *zip(LOAD_WALK, (f'{walk:.3g}' for walk in motion.load_walk()), strict=True),
         ]
-        level, message = OK, 'the modes foretell the samples'
+        level, message = OK, 'the modes predict the samples'
         worst = max(new.means())
         reported = motion.inertia
         base = (reported.count, reported.late, reported.ended, self._session.rejected[ACCELERATION])
@@ -228,7 +228,7 @@ class HealthReporter:
             axis = AXES[new.means().index(worst)]
             level = WARN
             message = (
-                f'the modes of the rig file do not foretell {axis}: NIS {worst:.2f} a sample; '
+                f'the modes of the rig file do not predict {axis}: NIS {worst:.2f} a sample; '
                 '`psd-deflection identify` measures them'
             )
         return (DiagnosticEntry(name, level, message, tuple(values)),)
@@ -293,7 +293,7 @@ def _doubt(pipeline: Pipeline, contradictions: int) -> str:
     """What widens the covariance of blocks that all have estimates; '' if nothing does."""
     stamped = pipeline.estimator
     if contradictions:
-        wrong = stamped.most_likely_wrong() or 'which one is wrong cannot be told'
+        wrong = stamped.most_likely_wrong() or 'which one is wrong cannot be determined'
         readings = 'four readings' if len(pipeline.rig.psds) == 2 else 'readings'
         return f'the {readings} contradict each other in {contradictions} blocks: {wrong}'
     if stamped.vibrates:

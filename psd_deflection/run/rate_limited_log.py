@@ -13,7 +13,7 @@ from psd_deflection.base.log import INFO, LogCallback
 FIRST_WAIT_S = 10.0
 LONGEST_WAIT_S = 3600.0
 MOST_REASONS = 12
-"""Reasons of one kind that are told apart; further ones are counted together."""
+"""Reasons of one kind that are distinguished; further ones are counted together."""
 _DETAIL = re.compile(r"""'[^']*'|"[^"]*"|(?<!\w)[-+]?\d[\d.e+-]*""")
 """What may differ between two lines of one reason: numbers, and words that are quoted."""
 

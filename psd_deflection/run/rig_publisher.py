@@ -23,7 +23,7 @@ MEMORY_S = 10.0
 LATE = 100
 """Blocks after which the memory is sent though a segment is under way, if that segment is short."""
 MOST_BUFFERED = 20_000
-"""Numbers of a segment under way that are told; a longer one is waited for."""
+"""Numbers of a segment under way that are reported; a longer one is waited for."""
 
 
 class RigPublisher:

@@ -30,7 +30,7 @@ def names(found: PlantDiscovery) -> set[str]:
 
 @pytest.mark.slow
 def test_the_boom_lacks_gravity_and_its_root_gives_way() -> None:
-    """Its stiffness is not known and no finding. Clamp and length cannot be told apart, and are named so."""
+    """Its stiffness is not known and no finding. Clamp and length cannot be distinguished, and are named so."""
     found = discover_in(Boom(without=('tip_force',)))
     weight, root = found.effects
     assert weight.active.effect.name == 'self_weight'

@@ -100,7 +100,7 @@ def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -
     nothing = {**reported(), 'unknown': [], 'verdict': 'nothing_missing'}
     row = evaluated(truth, {**nothing, 'setup': found})
     assert (row['stage'], row['variables'], row['stage_alone'], row['note']) == (True, True, False, True)
-    # Under forces along y it acts at five of the noted loads.
+    # Under forces along y it acts at five of the annotated loads.
     several = {**truth, 'of': ['load_fy'], 'where': 'load_fx', 'at': 0.1, 'sign': -1.0}
     for law, message in (
         (truth, []),

@@ -329,7 +329,7 @@ def test_the_stamp_goes_by_the_rate_of_the_rig_file() -> None:
 
 
 def test_a_known_load_is_applied_again_at_its_nanosecond() -> None:
-    """While the samples are lost the filter foretells what a load does that acts from then on."""
+    """While the samples are lost the filter predicts what a load does that acts from then on."""
     rig = load_rig(overrides={'filter': 'modal'})
     live, again, rounded = Pipeline(rig), Pipeline(rig), Pipeline(rig)
     counts = still(REST, 20 * 12, 1)

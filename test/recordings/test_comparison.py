@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Rounding is told from other differences, and who made the recording decides whether it may be there."""
+"""Rounding is distinguished from other differences, and who made the recording decides whether it may be there."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ first = CompensatorNode._enable
 CompensatorNode._enable = lambda *words: (first if words[1].data else hang)(*words)
 sys.exit(main())
 """
-"""Our program, whose main thread waits for its input for ever when the offsets are to be released."""
+"""Our program, whose main thread waits for input without end when the offsets are to be released."""
 
 
 @pytest.fixture

@@ -379,7 +379,7 @@ def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, disk: Disk, t
         path = tmp_path / 'zero.json'
         return json.loads(path.read_text())['psd_1.zero'] if path.exists() else None
 
-    # The end waits for it, but not for ever.
+    # The end waits for it, with a limit.
     until(lambda: kept() == [1e-4, -2e-4])
     live.session.close()
     assert kept() == [1e-4, -2e-4]

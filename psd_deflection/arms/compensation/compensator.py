@@ -13,7 +13,7 @@ deflection is stale, not finite, too uncertain, too large or jumping, the joints
 or do not follow, the robot does not run, or somebody else commands it. They move again after some
 good estimates in a row, and go back to zero if that takes long or when the compensation is switched
 off. A controller that does not tell what it has, or is elsewhere than it was sent, hears
-nothing until that is mended; if the compensation was switched off meanwhile, the offsets that it
+nothing until that is corrected; if the compensation was switched off meanwhile, the offsets that it
 still has go back to zero then. Whatever happens, what is sent moves by no more than ``max_rate``
 times the time since something was sent.
 
@@ -195,7 +195,8 @@ class Compensator:
         """Hold for as long as ``why`` is not '': the robot does not run, or, with ``other_publisher``, somebody else
         commands it.
 
-        While a rival does, offsets that the controller still has after we fell silent are not taken back either.
+        While another publisher does, offsets that the controller still has after we fell silent are not taken back
+        either.
         """
         if self._stop and not why and self._fault == self._stop:
             # That is over. What it waits for now is what comes next, or does not come.

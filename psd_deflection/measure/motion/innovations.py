@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How well a filter foretold what it then saw."""
+"""How well a filter predicted what it then saw."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Innovations(NamedTuple):
-    """How well the filter foretold the samples so far.
+    """How well the filter predicted the samples so far.
 
     ``squares``: sums of the normalised innovations squared (NIS) of dX, dY, theta; each has the
     mean 1 a sample.

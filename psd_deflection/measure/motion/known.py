@@ -51,7 +51,7 @@ class KnownLoads:
         return self.held is not None or bool(self._waiting)
 
     def is_new(self, load: AppliedLoad) -> bool:
-        """Whether ``load`` differs from the last one that was told."""
+        """Whether ``load`` differs from the last one that was reported."""
         if self._waiting:
             return load[1:] != self._waiting[-1][1:]
         return self.held is None or load[1:] != tuple(self.held.tolist())

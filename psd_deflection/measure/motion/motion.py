@@ -4,7 +4,7 @@
 
 How fast the load wanders is not known and changes: a link at rest, in operation, and one whose load
 has just been switched differ by six orders of magnitude. So each axis has K rates. In every block
-the filter runs with all of them, and Bayes' rule weighs them by how well they foretold the samples
+the filter runs with all of them, and Bayes' rule weighs them by how well they predicted the samples
 (a Markov chain says how likely a change is); the next block starts from mean and covariance of them
 all (generalised pseudo-Bayes of first order, Bar-Shalom, Li & Kirubarajan 2001, 11.6.4). With rates
 that the rig file states, K is 1.
@@ -177,7 +177,7 @@ class ModalFilter:
         self._tables.fill(own, rates)
 
     def is_new(self, load: AppliedLoad) -> bool:
-        """Whether ``load`` differs from the last one that was told."""
+        """Whether ``load`` differs from the last one that was reported."""
         return self._known.is_new(load)
 
     def load(self, load: AppliedLoad) -> None:
@@ -261,7 +261,7 @@ class ModalFilter:
         """Put right what accelerations did in the last block that were not known then.
 
         The samples of the block have shown some of it: what the filter would have found is linear
-        in what is foretold. The mean square of what that changes is how far what is published was
+        in what is predicted. The mean square of what that changes is how far what is published was
         off, and will be.
         """
         came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late

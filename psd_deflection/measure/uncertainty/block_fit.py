@@ -47,7 +47,7 @@ _BIAS = 0.5
 
 _LASTING = 250.0
 """Blocks, at the most, of the mean of motion that goes on alike: 5 s of 20 samples at 1 kHz. Its error is a fifth of
-that of the short one, so that motion which bends a block by a fifth of its noise is told from noise."""
+that of the short one, so that motion which bends a block by a fifth of its noise is distinguished from noise."""
 
 _OVER = 0.35
 """Times the noise and the motion of late: a lasting mean that begins anew and is larger by that is of motion that is
@@ -113,7 +113,7 @@ class _Vibration(NamedTuple):
 
 
 class _Terms(NamedTuple):
-    """What the samples that are present say of the coefficients, for K orders of which ``reported`` can be told.
+    """What the samples that are present say of the coefficients, for K orders of which ``reported`` can be determined.
 
     ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (told, C):
     variances of the first ones; ``sure`` (told, C): how much a block says of them, 1 of a whole one.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps of the converter as the samples show them, whatever the rig file says.
 
-Volts of a converter lie on a lattice: their differences are multiples of its step. The greatest common divisor of the
+Volts of a converter lie on a grid: their differences are multiples of its step. The greatest common divisor of the
 differences of one channel is that step, once neighbouring levels were seen; noise makes them follow each other. It is
 found by Euclid's algorithm, sample by sample, within the rounding of float32. One difference that is no multiple of it
 makes it finer, so that the steps of a finer converter are never taken for coarse: 19 independent differences all being

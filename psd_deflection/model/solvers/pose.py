@@ -53,7 +53,7 @@ class PoseSolver(Solver):
         if singular_values[1] < SMALLEST_BASE_LINE:
             raise SolverError(
                 'the PSD surfaces lie on one line in space: turning the plate about it changes no dot, so that '
-                'twist and tilt cannot be told apart; move one PSD off the line'
+                'twist and tilt cannot be distinguished; move one PSD off the line'
             )
         self._centers = np.asarray(geometry.centers, dtype=np.float64)
         self._beams = np.asarray(geometry.beams, dtype=np.float64)

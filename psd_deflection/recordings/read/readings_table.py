@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads a table of readings: a CSV with one row for each load that was hung on the link (docs/recording.md).
 
-It has no column ``t``, by which it is told from a recording; or it has one, and references in place of samples.
+It has no column ``t``, by which it is distinguished from a recording; or it has one, and references in place of
+samples.
 """
 
 from __future__ import annotations

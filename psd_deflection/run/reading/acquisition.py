@@ -58,7 +58,7 @@ GIVE_UP_TIMES = 5
 """Number of give_up() calls at stop, READ_TIMEOUT_S apart."""
 
 NEWS = 3
-"""Events of one kind that are told one by one, before they are counted and told together."""
+"""Events of one kind that are reported one by one, before they are counted and told together."""
 
 RECORDED_RESTARTS = 10_000
 """Restarts of one run that are recorded, and steps of its time map: a device that does nothing else must not fill the

@@ -42,7 +42,7 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, j
 LEVEL = 0.05
 """Share of rigs that did not move and are said to have moved."""
 LIKE = 3.0
-"""Natural logarithm of a Bayes factor below which two groups cannot be told apart."""
+"""Natural logarithm of a Bayes factor below which two groups cannot be distinguished."""
 BELIEVED = 0.02
 """Share of the tolerances below which a calibration is not believed: its covariance is that of a linear model."""
 SHIFT = 3.0
@@ -68,7 +68,7 @@ class MovedGroup(NamedTuple):
 
 class CalibrationCheck(NamedTuple):
     """``unchanged``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
-    first cannot be told from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
+    first cannot be distinguished from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
     """
 
     unchanged: bool

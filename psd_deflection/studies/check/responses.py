@@ -5,8 +5,8 @@
 The simulation has the plate's geometry and the ringing of both modes. So what is left of a regression on its dots is
 wiring, gain, noise and drift. Each channel is a combination of the four simulated dots, whatever the wiring is; a
 constant and a straight line in time are fitted with them: where the dots were before load, and drift. The movement by a
-load is that combination of the dots that the load alone moves, at rest. Loads that always came together cannot be told
-apart and count as one.
+load is that combination of the dots that the load alone moves, at rest. Loads that always came together cannot be
+determined apart and count as one.
 """
 
 from __future__ import annotations

@@ -276,7 +276,7 @@ def level_rows(checkup: Checkup) -> list[tuple[str, str]]:
     )
     drift += '  µm a minute'
     if checkup.drift_sd.max() > SIGNIFICANT_DRIFT:
-        drift = 'cannot be told: the recording is too short'
+        drift = 'cannot be determined: the recording is too short'
     hum = 'none at 50 or 60 Hz'
     if measured.hum.max() > 0.0:
         sizes = '  '.join(f'{c} {v * 1e3:.1f}' for c, v in zip(CHANNELS, measured.hum.tolist(), strict=True))

@@ -112,9 +112,9 @@ def note_finding(note: LoadNote, name: str) -> Finding:
 
 
 def unit_findings(sizes: FloatArray, evidence: float = 0.0) -> tuple[list[Finding], FloatArray]:
-    """Loads that are noted in another unit; by what each of the noted loads (3,) is to be multiplied.
+    """Loads that are noted in another unit; by what each of the annotated loads (3,) is to be multiplied.
 
-    ``sizes`` (3,): of the movement under each load over that of the noted load, NaN where nothing tells.
+    ``sizes`` (3,): of the movement under each load over that of the annotated load, NaN where nothing tells.
     """
     factors = np.ones(3)
     units = _units(np.abs(sizes))

@@ -129,7 +129,9 @@ def set_up(problem: Problem) -> Problem:
 
 
 def noise_level(problem: Problem) -> Problem:
-    """Return whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
+    """Return whether the noise is the rig file's. What is unknown may move faster than noise can be distinguished from
+    it.
+    """
     if problem.unknown or rig_of(problem).recorded.value_grid is not None:
         return problem
     ws = workspace_of(problem.comparison)

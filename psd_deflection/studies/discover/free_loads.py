@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The search with its verdict: beside the loads as noted, or beside free ones if they were noted wrong."""
+"""The search with its verdict: beside the loads as annotated, or beside free ones if they were noted wrong."""
 
 from __future__ import annotations
 
@@ -105,8 +105,8 @@ SEARCH = (search, effective_loads, weigh, refitted)
 
 
 def searched(problem: Problem) -> Problem:
-    """The search with its verdict: with the loads as noted, or free if they were noted wrong. If much remains, with the
-    ringing free that outlasts what is left out.
+    """The search with its verdict: with the loads as annotated, or free if they were noted wrong. If much remains, with
+    the ringing free that outlasts what is left out.
     """
     problem = _searched(problem)
     ws, effects = workspace_of(problem.comparison), problem.result.fit.effects
@@ -153,7 +153,7 @@ def _searched(problem: Problem) -> Problem:
 
 
 def _as_annotated(problem: Problem, with_free: Problem) -> Problem:
-    """``with_free``; or the search as noted, from the effects that were found beside free loads, if these leave no
+    """``with_free``; or the search as annotated, from the effects that were found beside free loads, if these leave no
     more.
     """
     ws, effects = problem.comparison, with_free.fit.effects
@@ -161,7 +161,7 @@ def _as_annotated(problem: Problem, with_free: Problem) -> Problem:
     numbers = sum(isinstance(d, LoadDirection) for d in workspace_of(with_free.comparison).directions)
     if begun.chi2 - with_free.fit.chi2 > problem.search.penalty * numbers:
         return with_free
-    problem.progress('as noted')
+    problem.progress('as annotated')
     for step in (partial(search, begun=begun), *SEARCH[1:]):
         problem = step(problem)
     return problem
@@ -215,8 +215,8 @@ def _best_beside(problem: Problem, columns: Sequence[FloatArray]) -> list[FloatA
 
 
 def _rounded(problem: Problem) -> bool:
-    """Whether the loads of ``problem``, which were free, leave next to nothing and are the noted ones before they were
-    rounded.
+    """Whether the loads of ``problem``, which were free, leave next to nothing and are the annotated ones before they
+    were rounded.
     """
     ws, free = workspace_of(problem.comparison), rig_of(problem).recorded.wrong
     if ws.gap(problem.fit.difference) >= SIGNIFICANT * ws.floor():

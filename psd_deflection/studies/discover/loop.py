@@ -24,9 +24,9 @@ SCRIPT, LISTED = 'next_loads.csv', 'next.yaml'
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopResult(StudyResult):
-    """``discovery``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if rivals
-    are left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or no more
-    recordings were allowed. None: it was only planned.
+    """``discovery``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if
+    alternatives are left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or
+    no more recordings were allowed. None: it was only planned.
     """
 
     study, json_name = 'discover', 'result.json'
@@ -113,7 +113,7 @@ def _listed(made: Sequence[tuple[str, Plan]]) -> str:
 
 
 def next_of(discovery: Discovery, limits: Limits | None = None) -> Plan | None:
-    """Return the next recording after a search; None if it left no rivals."""
+    """Return the next recording after a search; None if it left no alternatives."""
     return plan_next(discovery.workspace, discovery.fit, discovery.alternative_fits, limits)
 
 
@@ -140,8 +140,8 @@ def run_loop(
         discovery = search(known)
         progress('planning')
         plan = next_of(discovery, limits)
-        # A rival with more parameters that came out as the named effect would be has nothing left that could be tested:
-        # nothing within the limits needs its further ones.
+        # An alternative with more parameters that came out as the named effect would be has nothing left that could be
+        # tested: nothing within the limits needs its further ones.
         needed = any(alternative.parameters <= discovery.fit.parameters for alternative in discovery.alternative_fits)
         if plan is None or not (plan.useful or (discovery.unsettled and needed)):
             return LoopResult(discovery, tuple(plans), None, 'unique')

@@ -34,7 +34,7 @@ from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
 SEPARATES = 21.6
-"""lambda sin^2(theta) from which two effects are told apart: lambda sin^2(theta/2) >= 5.4, small angles."""
+"""lambda sin^2(theta) from which two effects are distinguished: lambda sin^2(theta/2) >= 5.4, small angles."""
 SURE = 60.0
 """Expected chi-square beyond which more is worth nothing: its scatter of 2 sqrt(60) leaves ``SEPARATES``."""
 WORTH = 0.02
@@ -112,7 +112,7 @@ class Plan:
 
     @property
     def useful(self) -> bool:
-        """Whether any recording within the limits tells a rival from the named model."""
+        """Whether any recording within the limits tells an alternative from the named model."""
         return any(t.separable for t in self.discriminations)
 
     @property
@@ -140,13 +140,17 @@ class Plan:
 
     @property
     def table(self) -> str:
-        """The loads, one row for each that is held or swept, if the plan is worth it; what becomes of each rival."""
+        """The loads, one row for each that is held or swept, if the plan is worth it; what becomes of each
+        alternative.
+        """
         rows: list[tuple[str, ...]] = [('load', 'Fx / N', 'Fy / N', 'Tz / N m', 'for / s')]
         for script in self.script:
             kind, loads, *rest = script.split(':')
             words = 'hold' if kind != 'chirp' else f'sweep {rest[0].replace(",", " to ")} Hz, up to'
             rows += [(words, *load.split(','), rest[-1]) for load in loads.split(';')]
-        rows_of_alternatives = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
+        rows_of_alternatives = [
+            ('instead of', 'alternative', 'expected chi-square', 'if the alternative is true', 'at most')
+        ]
         rows_of_alternatives += [
             (t.named, t.alternative, f'{t.separation:.0f}', f'{t.reverse:.0f}', f'{t.possible:.0f}')
             for t in self.discriminations
@@ -191,13 +195,15 @@ class Plan:
 def plan_next(
     workspace: Workspace, named: Fit, alternatives: Sequence[Fit], limits: Limits | None = None
 ) -> Plan | None:
-    """Return the recording within ``limits`` that best tells ``named`` from ``alternatives``; None without rivals."""
+    """Return the recording within ``limits`` that best tells ``named`` from ``alternatives``; None without
+    alternatives.
+    """
     if not alternatives:
         return None
     limits = limits or Limits()
     models = [named, *alternatives]
     known = [m.jacobian.T @ m.jacobian for m in models]
-    # One of the rivals may be true: then it is to be told from the other rivals too.
+    # One of the alternatives may be true: then it is to be distinguished from the other alternatives too.
     pairs = list(itertools.permutations(range(len(models)), 2))
     rig = workspace.observations[0].rig
 

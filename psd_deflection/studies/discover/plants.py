@@ -81,7 +81,7 @@ class Plant(ABC):
         return {}
 
     def variables(self) -> Mapping[str, Sequence[FloatArray]]:
-        """Of what an unnamed smooth function may be told, by name: of each case (n,), or (n, k) if a variable has
+        """Of what an unnamed smooth function may be determined, by name: of each case (n,), or (n, k) if a variable has
         several coordinates, as a direction has. By default each of the inputs.
         """
         return self.inputs()

@@ -73,7 +73,7 @@ class Problem:
     """``search``: what is compared, and the signatures. ``result``: the model that the search chose. ``fit``: the model
     so far; ``heldout``: the gain of each of its effects on unseen load cases. ``null``: the model as described, against
     which gaps count. ``before``, ``residual``: where ``null`` and ``fit`` leave structure. ``named``: the effects of
-    ``fit`` that are told. ``remainder``: what is unknown as a function of named variables.
+    ``fit`` that are reported. ``remainder``: what is unknown as a function of named variables.
     ``predictive``: the model that predicts best, None if none was looked for.
     ``setup``: what is wrong with the set-up, with ``values`` that put the rig file right.
     ``alternative_fits``: complete models in place of ``fit``; ``unsettled``: names of what fits as well. ``law``: of

@@ -4,8 +4,8 @@
 
 It is a plant for :func:`~psd_deflection.studies.discover.plant_search.discover_in`. Nobody knows how long each
 reading was averaged, so the level of what remains is fitted. An effect takes part if what it does to a row depends
-on that row alone: what depends on time or on the row before (drift, creep, friction, mains) cannot be told from a
-table.
+on that row alone: what depends on time or on the row before (drift, creep, friction, mains) cannot be distinguished
+from a table.
 """
 
 from __future__ import annotations

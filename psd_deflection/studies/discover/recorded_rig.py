@@ -174,7 +174,7 @@ def proposals_of(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> 
 
 
 def value_grid_gain(workspace: Workspace, value_grid: ActiveEffect) -> float:
-    """Log-likelihood of all readings lying on the lattice: by chance each does so with probability LSB/step."""
+    """Log-likelihood of all readings lying on the grid: by chance each does so with probability LSB/step."""
     lsb = workspace.observations[0].rig.converter.volts_per_count
     return (
         workspace.size

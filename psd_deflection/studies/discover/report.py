@@ -189,7 +189,7 @@ def _effect_section(effect: NamedEffect) -> str:
     if effect.fitted_alternatives:
         fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.fitted_alternatives]
         out.append('<p>What explains these recordings nearly as well in its place:</p>')
-        out.append(table(('rival', 'fitted', 'BIC worse by'), fitted))
+        out.append(table(('alternative', 'fitted', 'BIC worse by'), fitted))
     if effect.suggestion is not None:
         out.append(f'<p>To decide: {html.escape(effect.suggestion.text)}.</p>')
     out.append('<details><summary>Evidence</summary>')
@@ -198,7 +198,7 @@ def _effect_section(effect: NamedEffect) -> str:
         f'load cases {effect.heldout.gain:+.1f} ± {effect.heldout.error:.1f}.</p>'
     )
     if effect.alternatives:
-        verdicts = {True: 'cannot be told apart', False: 'worse'}
+        verdicts = {True: 'cannot be distinguished', False: 'worse'}
         alternatives = [
             (n, f'{loss:.1f}', f'{bic:.1f}', verdicts[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""When noted loads began to act, by the motion of the dots: a person notes a weight some seconds after it was hung.
+"""When annotated loads began to act, by the motion of the dots: a person notes a weight some seconds after it was hung.
 
 Steps of the dots (:mod:`.steps`) and notes are matched in their order. If they agree, or all notes are late alike,
 nothing is changed. Else each load gets the time of its step. Only the link's natural frequencies are taken from the rig
@@ -33,7 +33,7 @@ from psd_deflection.studies.loads.steps import (
 )
 
 APART_S = 0.25
-"""Noted changes that follow each other faster than this are a sweep or a ramp, not notes of a person."""
+"""Annotated changes that follow each other faster than this are a sweep or a ramp, not notes of a person."""
 FARTHEST_S = 30.0
 """A note belongs to no step that is farther away."""
 ALIKE_S = 0.002
@@ -43,7 +43,7 @@ ONE_DELAY_S = 0.9
 GRADUAL_S = 0.1
 """A load that took longer than this was applied slowly."""
 BETTER = 4.0
-"""Factor by which mended times must leave less of the movement than the noted ones."""
+"""Factor by which corrected times must leave less of the movement than the annotated ones."""
 SETTLED_S = 5.0
 """Time constants of the slower mode after which a link is at rest."""
 ROUGH = 3.0
@@ -59,7 +59,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class CorrectedNote:
-    """One noted load: ``number`` from 1; ``load`` fx N, fy N, tz N m.
+    """One annotated load: ``number`` from 1; ``load`` fx N, fy N, tz N m.
 
     ``annotated``, ``applied``: s from the first sample.
 
@@ -138,8 +138,8 @@ class CorrectedNote:
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedLoads:
     """``loads`` (n, 3) N, N, N m as they acted; ``notes``: those that were wrong; ``unused`` (n,): samples in motion
-    that the mended loads do not describe; ``measured``: those that were measured; ``timed``: all whose time is fitted,
-    also those that were right as noted: a fitted time is known no better than what else the dots do then.
+    that the corrected loads do not describe; ``measured``: those that were measured; ``timed``: all whose time is
+    fitted, also those that were right as annotated: a fitted time is known no better than what else the dots do then.
     """
 
     loads: FloatArray
@@ -159,7 +159,7 @@ def correct_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> CorrectedLoa
     """The loads with the times at which they acted and without the noise of a load cell; None if they are right as
     noted or the motion does not tell.
 
-    ``dots`` (n, 2P) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
+    ``dots`` (n, 2P) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as annotated, held.
     """
     calm, measured = without_cell_noise(loads)
     corrected = _corrected_times(rig, dots, calm)
@@ -238,7 +238,9 @@ def loads_with_times(
 def without_rough_motion(
     rig: Rig, corrected: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray
 ) -> CorrectedLoads:
-    """Return the mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
+    """Return the corrected loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is
+    another.
+    """
     t: FloatArray = np.arange(len(corrected), dtype=np.float64) / rig.converter.sample_rate_hz
     unused = np.zeros(len(corrected), dtype=bool)
     notes_used = []
@@ -283,7 +285,9 @@ def expected_movements(rig: Rig, changes: FloatArray) -> FloatArray:
 
 
 def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
-    """Pairs of a noted change and a step, both in their order, at least cost; changes that move nothing have none."""
+    """Pairs of an annotated change and a step, both in their order, at least cost; changes that move nothing have
+    none.
+    """
     if not steps or float(sizes.sum()) <= 0.0:
         return []
     significant = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
@@ -343,7 +347,9 @@ def in_motion(rig: Rig, note: CorrectedNote, t: FloatArray) -> BoolArray:
 
 
 def is_rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
-    """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 2P): means of blocks of ``size``."""
+    """Whether the link rings otherwise than the corrected load makes it; ``rest`` (n, 2P): means of blocks of
+    ``size``.
+    """
     blocks, rings = rest[::size], ringing[::size]
     noise = 0.5 * np.nanmedian((np.diff(blocks, axis=0) ** 2).sum(axis=1))
     valid = blocks[rings & np.all(np.isfinite(blocks), axis=1)]

@@ -67,8 +67,8 @@ CLOSES = 0.2
 class Plateau:
     """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
 
-    ``number``: of the noted change that began it, from 1; 0 before the first. ``unannotated``: nothing was noted when
-    it began; ``end_unannotated``: nor when it ended. ``annotated`` (3,): N, N, N m.
+    ``number``: of the annotated change that began it, from 1; 0 before the first. ``unannotated``: nothing was noted
+    when it began; ``end_unannotated``: nor when it ended. ``annotated`` (3,): N, N, N m.
     """
 
     recording: int
@@ -112,7 +112,7 @@ def plateaus(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateauLoads:
-    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
+    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the annotated one, N, N, N m.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
     ``beside`` (2P - 3, m): what no movement of the plate makes, m.
@@ -324,7 +324,9 @@ def may_be_rounded(implied: PlateauLoads) -> bool:
 
 
 def are_rounded(implied: PlateauLoads, loads: FloatArray) -> bool:
-    """Whether the loads that ``implied`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
+    """Whether the loads that ``implied`` asks for are the annotated ones before these were rounded; see
+    :func:`rounded`.
+    """
     return rounded(implied.annotated, np.array([p.of(loads) for p in implied.plateaus]).reshape(-1, 3) + implied.more)
 
 
@@ -397,7 +399,7 @@ class WrongNote:
 
     @property
     def off(self) -> FloatArray:
-        """(3,): by what it differs from the noted load, N, N, N m."""
+        """(3,): by what it differs from the annotated load, N, N, N m."""
         return np.asarray(np.abs(self.applied - self.plateau.annotated))
 
     @property
@@ -479,7 +481,7 @@ def as_applied(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
 def _begun(p: Plateau, name: str) -> str:
     if not p.unannotated:
         return f'the {ordinal(p.number)} load of {name} was noted wrong'
-    after = f' after the {ordinal(p.number)} noted load' if p.number else ''
+    after = f' after the {ordinal(p.number)} annotated load' if p.number else ''
     return f'something was hung or taken off{after} of {name} and not noted'
 
 

@@ -79,8 +79,8 @@ def swaying(
     again: Callable[[Sequence[Plateau]], PlateauLoads],
     period: float,
 ) -> list[SwayingLoad]:
-    """Return the holds of ``implied`` in which the link swings. ``annotated``: between noted changes; ``again``: the
-    loads that other plateaus ask for; ``period``: s from one sample to the next.
+    """Return the holds of ``implied`` in which the link swings. ``annotated``: between annotated changes; ``again``:
+    the loads that other plateaus ask for; ``period``: s from one sample to the next.
     """
     implied = _not_cut(implied, annotated, again)
     size, fine = implied.size, period * implied.size
@@ -191,7 +191,7 @@ def peak_frequency(f: FloatArray, power: FloatArray) -> float:
 def _not_cut(
     implied: PlateauLoads, annotated: Sequence[Plateau], again: Callable[[Sequence[Plateau]], PlateauLoads]
 ) -> PlateauLoads:
-    """What swings seems to step, too: the time of a noted load is whole if steps cut it into too short pieces."""
+    """What swings seems to step, too: the time of an annotated load is whole if steps cut it into too short pieces."""
     listed = list[Plateau]()
     for annotated_hold in annotated:
         pieces = [p for p in implied.plateaus if p.number == annotated_hold.number]

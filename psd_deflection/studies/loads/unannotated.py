@@ -18,7 +18,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.loads.plateaus import PLATE, PLATE_M, SHARE, STANDS_OUT, TOLERANCE, PlateauLoads
 
 MANY = 3
-"""Changes that nobody noted, during one noted load."""
+"""Changes that nobody noted, during one annotated load."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,10 @@ class UnannotatedTime:
 
 
 def unannotated_times(implied: PlateauLoads, samples: int, period: float) -> list[UnannotatedTime]:
-    """Those of a recording of so many ``samples``; none if no noted load would be left. ``period``: s from one sample
-    to the next.
+    """Those of a recording of so many ``samples``; none if no annotated load would be left. ``period``: s from one
+    sample to the next.
 
-    A change counts if the plate moves with it by what no effect does to the noted load.
+    A change counts if the plate moves with it by what no effect does to the annotated load.
     """
     allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(implied.annotated).max(initial=0.0))
     out = []

@@ -28,7 +28,7 @@ TRIED = 5
 APART = 5
 """Samples between two offsets that are tried, at least."""
 ALTERNATIVE_LOSS = 20.0
-"""An offset is a rival if its chi-square is larger by less."""
+"""An offset is an alternative if its chi-square is larger by less."""
 MOVES = 100.0
 """The motion explains the reference if it lowers chi-square by more. With noise alone the best of thousands of offsets,
 each with nine scales, lowers it by 30 to 40."""
@@ -38,7 +38,7 @@ SETTLED = 1e-7
 VAGUE = 0.01
 """s. The motion does not tell an offset that is less certain."""
 LONGEST_MEMORY = 0.97
-"""Correlation of one error with the next, at most: of a slower drift no deviation can be told."""
+"""Correlation of one error with the next, at most: of a slower drift no deviation can be determined."""
 BIWEIGHT = 4.685
 """Tukey's constant: 95 % as precise as least squares without outliers."""
 
@@ -77,12 +77,12 @@ class Offset:
             if self.explained and self.alternatives:
                 alternatives = ', '.join(f'{1e3 * r:+.1f}' for r in self.alternatives)
                 return (
-                    'The offset between the clocks is not told: the motion repeats itself, so that '
+                    'The offset between the clocks is not determined: the motion repeats itself, so that '
                     f'{1e3 * self.value:+.1f} and {alternatives} ms fit alike. '
                     'Record an event that comes once, such as a push or a step of the load.'
                 )
             return (
-                'The offset between the clocks is not told: the link moves too little or too slowly. '
+                'The offset between the clocks is not determined: the link moves too little or too slowly. '
                 'Record a few seconds in which it rings.'
             )
         size = 1e3 * abs(self.value)
@@ -143,7 +143,7 @@ def clock_offset(
 
 
 def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
-    """Return the offset up to ``largest`` s either way that fits best, and its rivals."""
+    """Return the offset up to ``largest`` s either way that fits best, and its alternatives."""
     fits: list[OffsetFit] = []
     best: OffsetFit | None = None
     for start in coarse_offsets(motion, t, poses, largest):

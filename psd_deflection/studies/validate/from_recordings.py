@@ -30,7 +30,7 @@ class ValidateProblem:
 
     ``t`` (k,), s, by the reference's clock, increasing. ``reference`` (k, 3), m, m, rad; ``sd`` (k, 3) of it if it is
     known; ``rejected``: measurements without an answer, by reason. ``estimate_sd`` (3,): of the published estimates.
-    ``align``: remove the offset between the clocks if it is told. ``largest``: offset that is looked for, s.
+    ``align``: remove the offset between the clocks if it is determined. ``largest``: offset that is looked for, s.
     ``exposure``: time over which each reference is a mean, s. ``sources``: what is compared, by name.
     ``marks``: of the recording, by the clock of the samples.
     """

@@ -233,7 +233,7 @@ def test_diagnostics_say_what_is_wrong_with_what_is_reported(run: motion.Run) ->
 
     reported = list(run.reported)
     through(pipeline, run, range(25), reported)
-    assert message() == (0, 'the modes foretell the samples')
+    assert message() == (0, 'the modes predict the samples')
     session.rejected[ACCELERATION], session.why_rejected[ACCELERATION] = 3, 'no frame'
     through(pipeline, run, range(25, 30), reported)
     assert message() == (1, '3 base accelerations rejected: no frame')

@@ -31,7 +31,7 @@ def test_a_switched_load_is_held_for_each_span_that_missed_it() -> None:
         held.add(at_rest(0.0), SURE, NO_NOISE)
     assert not held.variances.any()
     held.add(at_rest(1e-3), SURE, NO_NOISE)
-    # Spans of 1, 2 and 3 blocks end there and foretold rest; longer ones have not begun.
+    # Spans of 1, 2 and 3 blocks end there and predicted rest; longer ones have not begun.
     expected = LARGER**2 * 1e-6 / 9.0
     np.testing.assert_allclose(held.variances[0, :3], expected * np.array([1.0, 0.0, 1.0, 0.0]) * np.ones((3, 1)))
     assert not held.variances[:, 3:].any()

@@ -233,7 +233,7 @@ def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
     assert level_rows(replace(CHECKUP, levels=replace(LEVELS, stated=2.2255e-3)))[0][1].endswith('(rig file 2.23)')
     for sd, known in ((SIGNIFICANT_DRIFT, True), (1.001 * SIGNIFICANT_DRIFT, False)):
         short = replace(CHECKUP, drift_sd=np.array([0.0, 0.0, sd, 0.0]))
-        assert (level_rows(short)[3][1] != 'cannot be told: the recording is too short') is known
+        assert (level_rows(short)[3][1] != 'cannot be determined: the recording is too short') is known
 
 
 def test_the_tree_and_the_table_have_all_numbers() -> None:

@@ -107,7 +107,7 @@ def test_a_lag_of_the_amplifiers_is_found_beside_fitted_times_which_follow_it() 
 ROUNDED = np.array(
     [(0, 0, 0), (0, -50, 0), (5, -10, 0), (0, -35, 0), (20, -30, 18), (0, -25, -14), (30, -50, 0), (0, 0, 0)], float
 )
-"""As noted; what hung is nearly in proportion."""
+"""As annotated; what hung is nearly in proportion."""
 OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 
@@ -138,7 +138,7 @@ def test_a_weight_that_sways_is_reported_and_its_time_left_out(force: float, fre
 
 @pytest.mark.slow
 def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> None:
-    """It keeps where the load was, so that a mended load must not turn back by a thousandth behind its step."""
+    """It keeps where the load was, so that a corrected load must not turn back by a thousandth behind its step."""
     sticks = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
     annotated = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):

@@ -294,7 +294,7 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
         wide = np.array(covariance, dtype=np.float64)
         wide[4, 4] = (factor * 3.0) ** 2
         assert ('coefficient' in laws.fitted_law(law, fit, wide, 1).terms[1].sd) == reported
-    # Two pictures that are one: what cannot be told apart has a large deviation, and stays finite.
+    # Two pictures that are one: what cannot be distinguished has a large deviation, and stays finite.
     same = dataclasses.replace(fit, jacobian=np.column_stack((jacobian[:, :4], jacobian[:, 3])))
     assert laws.term_covariance(same)[3, 3] > 1e6 * covariance[3, 3]
 

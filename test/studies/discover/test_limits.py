@@ -40,7 +40,7 @@ from .test_rules import FINE, SIGMA, A, N, Plant, active, candidate, noise, pict
 
 
 def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It pulled the other way, half as much as noted: that is no unit, but the sign is wrong."""
+    """It pulled the other way, half as much as annotated: that is no unit, but the sign is wrong."""
     o = make_observation(warm=None)
     observed = dataclasses.replace(o, loads=o.loads * [1.0, -2.0, 1.0])
     corrected, findings, lines = setup.correct_wiring([observed], ())

@@ -175,7 +175,7 @@ def test_a_bad_limit_is_rejected(word: str, part: str) -> None:
 
 
 class Searches:
-    """Stands for discover: each search leaves one fewer rival of ``free`` parameters; plans are of ``useful``."""
+    """Stands for discover: each search leaves one fewer alternative of ``free`` parameters; plans are of ``useful``."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True, free: int = 1) -> None:
         self.observed: list[int] = []
@@ -214,7 +214,7 @@ def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch
     done = Searches(monkeypatch, 2, useful=False).settle()
     assert (done.outcome, len(done.plans)) == ('limits', 0)
     assert done.sentence.endswith('Nothing helps.')
-    # A rival that needs more parameters for the same is not needed.
+    # An alternative that needs more parameters for the same is not needed.
     assert Searches(monkeypatch, 2, useful=False, free=2).settle().outcome == 'unique'
     assert Searches(monkeypatch, 2, free=2).settle().sentence == 'The answer is unique after 2 more recordings.'
     done = Searches(monkeypatch, 9).settle(most=1)

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Noted times piece by piece: the fit of one time, what it leaves, and which loads are mended."""
+"""Annotated times piece by piece: the fit of one time, what it leaves, and which loads are corrected."""
 
 from __future__ import annotations
 
@@ -267,7 +267,9 @@ def with_pieces(
     fitted: dict[float, tuple[float, float]],
     residual: tuple[float, float] = (1.0, 100.0),
 ) -> list[tuple[float, float]]:
-    """Steps, their fitted times and what mended and noted loads leave; between which samples a time was fitted."""
+    """Steps, their fitted times and what corrected and annotated loads leave; between which samples a time was
+    fitted.
+    """
     between: list[tuple[float, float]] = []
 
     def fit(
@@ -353,7 +355,7 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
     assert not found.unused.any()
     assert found.measured == ()
-    # Right as noted, all late alike, or two milliseconds off: nothing is fitted.
+    # Right as annotated, all late alike, or two milliseconds off: nothing is fitted.
     for loads in (annotated_at(3000, 8000, 15000), annotated_at(3500, 8500, 15500), annotated_at(3002, 8000, 14998)):
         between.clear()
         assert correct_loads(RIG, dots, loads) is None

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Noted times piece by piece: steps of the dots, notes paired with them, loads as they acted, and the words."""
+"""Annotated times piece by piece: steps of the dots, notes paired with them, loads as they acted, and the words."""
 
 from __future__ import annotations
 

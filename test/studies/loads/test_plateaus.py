@@ -34,7 +34,7 @@ NEVER = annotated_as(2, (0, -20, 0))
 WORDS = {
     'load_value': 'the 5th load of x was noted wrong: from 20.000 s to 24.000 s (40 N, -40 N, 20 N m) hung, not '
     '(80 N, -80 N, 40 N m): note that',
-    'missing_load': 'something was hung or taken off after the 1st noted load of x and not noted: from 8.000 s to '
+    'missing_load': 'something was hung or taken off after the 1st annotated load of x and not noted: from 8.000 s to '
     '12.000 s (0 N, -50 N, 0 N m) hung, not (0 N, -20 N, 0 N m): note that',
 }
 
@@ -173,7 +173,7 @@ def test_lost_samples_are_no_load() -> None:
 ROUNDED = np.array(
     [(0, 0, 0), (0, -50, 0), (5, -10, 0), (0, -35, 0), (20, -30, 18), (0, -25, -14), (30, -50, 0), (0, 0, 0)], float
 )
-"""As noted; what hung is nearly in proportion."""
+"""As annotated; what hung is nearly in proportion."""
 OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 
@@ -289,7 +289,7 @@ GIVEN = load_rig(
 VARIED = np.array(
     [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (20, 10, 5)], float
 )
-"""Noted loads; each is like the others."""
+"""Annotated loads; each is like the others."""
 
 
 def observed(
@@ -509,7 +509,9 @@ def test_a_wrong_note_says_what_hung_from_when_to_when() -> None:
     )
     after = WrongNote(Plateau(0, 100, 5678, 1, True, annotated), annotated, 1e-3)
     assert (after.where, after.size) == ('0.100 s', 0.0)
-    assert after.words('x').startswith('something was hung or taken off after the 1st noted load of x and not noted: ')
+    assert after.words('x').startswith(
+        'something was hung or taken off after the 1st annotated load of x and not noted: '
+    )
 
 
 def world(

@@ -60,12 +60,12 @@ def test_the_interval_holds_95_percent() -> None:
     [
         (
             Offset(0.0123, 1e-3, 0.0, 1e-6, True, (-0.1, 0.25), 100),
-            'The offset between the clocks is not told: the motion repeats itself, so that +12.3 and -100.0, +250.0 ms '
-            'fit alike. Record an event that comes once, such as a push or a step of the load.',
+            'The offset between the clocks is not determined: the motion repeats itself, so that +12.3 and -100.0, '
+            '+250.0 ms fit alike. Record an event that comes once, such as a push or a step of the load.',
         ),
         (
             Offset(0.0123, 1e-3, 0.0, 1e-6, False, (-0.1,), 100),
-            'The offset between the clocks is not told: the link moves too little or too slowly. '
+            'The offset between the clocks is not determined: the link moves too little or too slowly. '
             'Record a few seconds in which it rings.',
         ),
         (

@@ -16,7 +16,7 @@ def _configure(physics: Physics, values: Values) -> None:
 EFFECT = Effect(
     name='tip_force',
     stage='link',
-    summary='a constant force at the tip is not in the noted load',
+    summary='a constant force at the tip is not in the annotated load',
     equation='ΔX += x (L^3/(3 EI) + c L^2), ΔY likewise with y, c the compliance of the clamp',
     source='beam theory',
     needs='recordings at two lengths, zeroed at one',

@@ -3,9 +3,9 @@
 """A law for what no effect of the catalogue explains: where it acts, on what it depends, and how.
 
 Terms are scored on the residual to first order, the best are refitted as effects in the simulation together with the
-effects found so far, and further terms are added and dropped by BIC (sparse regression in the loop). A law is told only
-if it passes the rule for an effect and explains most of what is left; laws that the recording cannot tell from it are
-listed beside it.
+effects found so far, and further terms are added and dropped by BIC (sparse regression in the loop). A law is reported
+only if it passes the rule for an effect and explains most of what is left; laws that the recording cannot tell from it
+are listed beside it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ NOTABLE = 1.1
 MOVES = 3.0
 """Means of blocks that differ by more floors than this are no noise."""
 WRITTEN = 2.0
-"""A law that leaves more floors than this on unseen load cases is told, but is no model: it is not written."""
+"""A law that leaves more floors than this on unseen load cases is reported, but is no model: it is not written."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,7 +274,7 @@ class LawSearch:
             moved.append(dataclasses.replace(law, acts_on=LOADS[row], stage='load', terms=of_load))
         out = [self.trial([m, *further_laws], trial.beside, 4) for m in moved]
         if law.acts_on in DOTS:
-            # A voltage is a dot over a constant: by no recording can the two be told apart.
+            # A voltage is a dot over a constant: by no recording can the two be distinguished.
             out.append(LawTrial((dataclasses.replace(law, stage='electronics'), *further_laws), trial.fit, trial.cost))
         return out
 

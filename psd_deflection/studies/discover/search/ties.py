@@ -28,7 +28,7 @@ CLEAR = 5.0
 
 @dataclass(frozen=True, slots=True)
 class CommonCause:
-    """``factor``: by what the rig's radii, or the noted loads, would have to be multiplied; with ``sd``."""
+    """``factor``: by what the rig's radii, or the annotated loads, would have to be multiplied; with ``sd``."""
 
     name: str
     factor: float
@@ -59,13 +59,15 @@ class Tie:
                 f"Measure the link's diameter: that tells the radius from the material."
             )
         return (
-            f'{words}{radius}, its material (E and G alike), or the noted loads times {factors["load_unit"]}. '
+            f'{words}{radius}, its material (E and G alike), or the annotated loads times {factors["load_unit"]}. '
             f"Static loads cannot tell these apart: measure the link's diameter, and weigh the loads."
         )
 
 
 def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
-    """Return the tie of the two stiffnesses among ``effects`` and their rivals, if they differ by the same share."""
+    """Return the tie of the two stiffnesses among ``effects`` and their alternatives, if they differ by the same
+    share.
+    """
     for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
         apart = SAME * math.hypot(first.sd, second.sd, EXACT * first.value)
         clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CLEAR
@@ -85,7 +87,7 @@ class _Share(NamedTuple):
 
 
 def _shares(effects: Sequence[NamedEffect]) -> Iterator[_Share]:
-    """The changes of stiffnesses, wherever they are named or a rival."""
+    """The changes of stiffnesses, wherever they are named or an alternative."""
     for named in effects:
         either: tuple[NamedEffect | Alternative, ...] = (named, *named.fitted_alternatives)
         for e in either:

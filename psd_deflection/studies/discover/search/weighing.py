@@ -1,6 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of the verdict: named effects with their uncertainty and their rivals, gaps, and what remains unknown."""
+"""The parts of the verdict: named effects with their uncertainty and their alternatives, gaps, and what remains
+unknown.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,7 @@ SIGNIFICANT = 1.5
 BLOCKS_HZ = 25.0
 """What is faster is in no mean of a block, and so in no gap."""
 ALTERNATIVE_BIC = 10.0
-"""An effect in place of the named one counts as its rival up to this loss in BIC."""
+"""An effect in place of the named one counts as its alternative up to this loss in BIC."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,9 +40,9 @@ LONGER = 0.5
 """A mode rings longer than the rig file says if it decays at less than this share of that rate."""
 RINGING = 'ringing after what is left out'
 SIGNIFICANT = 4.0
-"""Standard deviations by which a load that is told differs from the noted one."""
+"""Standard deviations by which a load that is told differs from the annotated one."""
 LEAST_REPORTED = (0.02, 0.02, 0.01)
-"""N, N, N m: a smaller difference is not told."""
+"""N, N, N m: a smaller difference is not reported."""
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -110,7 +110,7 @@ def movement_sums(observations: Sequence[Observation], base: Sequence[ActiveEffe
 
 
 def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
-    """What ``wiring`` leaves of the movement, and the size of each load (3,) over the noted one; NaN for none."""
+    """What ``wiring`` leaves of the movement, and the size of each load (3,) over the annotated one; NaN for none."""
     dots = dot_channels(len(wiring.axes))
     columns = [dots.index(wiring.columns[c]) for c in dots]
     signs = np.array(wiring.signs)[list(dots)]
