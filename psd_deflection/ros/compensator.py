@@ -357,6 +357,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
     def _check_robot(self) -> None:
         """Hold while the robot does not run, or while another node publishes what we publish."""
         now = time.monotonic()
+        self.gate.subscribe_to_kept()
         other_publishers = self.other_publishers() if self._drive else []
         other = f'another node publishes {other_publishers[0]}' if other_publishers else ''
         if self._drive and now - self._begun < LOOK_S:

@@ -20,7 +20,7 @@ from rclpy.action import GoalResponse
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
@@ -50,6 +50,8 @@ class InputGate:
     def __init__(self, node: Node, log: LogCallback, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
         self._limited_log = RateLimitedLog(log)
+        # By topic: what subscribes to messages that were kept, once there are any.
+        self._latched: dict[str, Callable[[], None]] = {}
         self.rejected = Tally()
         self.why: BoundedMap[str, str] = BoundedMap()
 
@@ -61,16 +63,24 @@ class InputGate:
         name: str = '',
         type_name: str = '',
     ) -> list[Subscription]:
-        """Subscribe to ``topic``, by its rows: ``take`` gets each message that ``check`` finds nothing wrong with.
+        """Subscribe to ``topic``, by its first row: ``take`` gets each message that ``check`` finds nothing wrong with.
+        By another row, which is latched, as soon as :meth:`subscribe_to_kept` finds a publisher for it.
 
         ``name``: on the graph, if it is not the topic's own. ``type_name``: of the message, if a parameter names it.
         A publisher whose messages cannot come, because they have to be reliable, counts as a rejection. Raises KeyError
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
         ROS does not take.
         """
-        return [
-            self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in HEARD[topic]
-        ]
+        found: list[Subscription] = []
+
+        def subscribe(row: GraphTopic) -> None:
+            found.append(self._subscribe(row, check, take, name or graph_name(row), type_name or row.type))
+
+        first, *latched = HEARD[topic]
+        subscribe(first)
+        for row in latched:
+            self._latched[name or graph_name(row)] = functools.partial(subscribe, row)
+        return found
 
     def serve(
         self,
@@ -155,6 +165,17 @@ class InputGate:
         self.rejected.add(topic)
         self.why[topic] = sanitize(why, LONGEST)
         self._limited_log.log(topic, f'{topic}: rejected: {self.why[topic]}', WARNING, self._clock(), NEWS)
+
+    def subscribe_to_kept(self) -> None:
+        """Subscribe by the latched rows for which a publisher now keeps its messages; to be called now and then.
+
+        DDS warns each publisher that keeps none of such a subscription, though another one gets its messages.
+        """
+        for topic, subscribe in tuple(self._latched.items()):
+            found = self._node.get_publishers_info_by_topic(topic)
+            if any(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for info in found):
+                del self._latched[topic]
+                subscribe()
 
     def settle(self) -> None:
         """Say what was counted and is due; to be called now and then."""

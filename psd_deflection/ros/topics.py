@@ -259,8 +259,7 @@ _IN = (
         'with `output: commands`: the command that the controller has, rad or m, by the names of the joints',
         _INPUT,
     ),
-    # One of them hears a driver that said it once, before we came; the other a driver that does not
-    # keep it.
+    # The first hears a driver that does not keep it, the second one that said it once, before we came.
     *(
         GraphTopic(
             RUNNING,
@@ -269,7 +268,7 @@ _IN = (
             'whether the robot runs its program, as ur_robot_driver says it; latched or not',
             delivery,
         )
-        for delivery in (LATCHED, Delivery(1))
+        for delivery in (Delivery(1), LATCHED)
     ),
     GraphTopic(SCALING, 'std_msgs/msg/Float64', _COMPENSATOR, 'speed of the robot, a share or per cent', _INPUT),
     GraphTopic(

@@ -12,11 +12,13 @@ import pytest
 pytestmark = pytest.mark.ros
 rclpy = pytest.importorskip('rclpy')
 
+from rclpy.event_handler import PublisherEventCallbacks  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from msg_adapters import INPUTS, LOAD, MARK, Delivery  # noqa: E402
+from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery  # noqa: E402
 from psd_deflection.base.log import INFO, WARNING  # noqa: E402
+from psd_deflection.ros.endpoints import qos  # noqa: E402
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic  # noqa: E402
 
@@ -124,6 +126,31 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
     assert gated.gate.why[TOPIC] == f'more than {MOST_A_SECOND} messages a second'
     gated.now += 1.0
     peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
+
+
+def test_a_publisher_that_keeps_nothing_is_offered_no_latched_subscription(
+    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """DDS would warn it of messages that do not come, while they do. One that keeps its message is heard, however late
+    the gate listens."""
+    row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', Delivery(1))
+    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row, row._replace(delivery=LATCHED)))
+    warned: list[Any] = []
+    publisher = peer.node.create_publisher(
+        String, TOPIC, 1, event_callbacks=PublisherEventCallbacks(incompatible_qos=warned.append)
+    )
+    gated.listen()
+
+    def heard(text: str) -> bool:
+        gated.gate.subscribe_to_kept()
+        return text in gated.heard
+
+    peer.until(lambda: publisher.publish(String(data='now')) or heard('now'), 'what is not kept')
+    assert not warned
+    peer.node.destroy_publisher(publisher)
+    publisher = peer.node.create_publisher(String, TOPIC, qos(LATCHED))
+    publisher.publish(String(data='before'))
+    peer.until(lambda: heard('before'), 'what was kept')
 
 
 def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
