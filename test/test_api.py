@@ -332,17 +332,6 @@ def test_a_rig_is_varied_by_replace() -> None:
         rig.replace(link={'lenght': 1.0})
 
 
-def test_every_function_takes_a_rig_or_its_file() -> None:
-    functions = [getattr(psd_deflection, name) for name in psd_deflection.__all__]
-    asked = {
-        function.__name__: function.__annotations__['rig']
-        for function in functions
-        if 'rig' in getattr(function, '__annotations__', {})
-    }
-    assert len(asked) >= 8
-    assert set(asked.values()) == {'Rig | str | Path | None'}, asked
-
-
 @pytest.mark.repeatable
 def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     rig = str(ROOT / 'config' / 'thesis_rig.yaml')

@@ -13,8 +13,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import psd_deflection
 
 PACKAGE = Path(psd_deflection.__file__).parent
@@ -120,27 +118,6 @@ def test_nothing_is_cached_for_ever_by_a_word_of_others() -> None:
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef) and node.args.args and any(map(_is_endless, node.decorator_list)):
                 raise AssertionError(f'{path}: {node.name} is cached without a bound; give lru_cache a maxsize')
-
-
-@pytest.mark.parametrize(
-    ('code', 'names'),
-    [
-        ('self.x: dict[str, int] = {}\n  def g(self, k): self.x[k] = 1', ['x']),
-        ('self.x = Counter()\n  def g(self, k): self.x[k] += 1', ['x']),
-        ('self.x = set()\n  def g(self, k): self.x.add(k)', ['x']),
-        ('self.x = collections.deque()\n  def g(self, k): self.x.append(k)', ['x']),
-        ('self.x: SimpleQueue[int] = queue.SimpleQueue()\n  def g(self, k): self.x.put(k)', ['x']),
-        ('self.x = []\n  def g(self, k): self.x += [k]', ['x']),
-        ('self.x = deque(maxlen=3)\n  def g(self, k): self.x.append(k)', []),
-        ('self.x = BoundedMap()\n  def g(self, k): self.x[k] = 1', []),
-        ('self.x = {}\n  def g(self): self.x["known"] = 1', []),
-        ('self.x = {}\n  def g(self, k): return self.x[k]', []),
-        ('x = {}\n    x[f] = 1', []),
-    ],
-)
-def test_the_rule_finds_what_grows(code: str, names: list[str]) -> None:
-    tree = ast.parse(f'class A:\n  def f(self, f):\n    {code}')
-    assert [name.rpartition(':')[2] for name in _growing('a.py', tree)] == names
 
 
 def _modules() -> Iterator[tuple[str, ast.Module]]:

@@ -82,13 +82,6 @@ def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
 
 
 @pytest.mark.slow
-def test_a_rig_of_two_has_no_parameter_of_a_third() -> None:
-    rig = load_rig()
-    assert len(rig.psds) == len(rig.beams) == 2
-    assert not [name for name in rig.flat() if name.startswith(('psd_3', 'beam_3'))]
-
-
-@pytest.mark.slow
 def test_what_a_third_psd_leaves_out_has_its_default_and_goes_round(three: Rig) -> None:
     assert three.psds[2].center == (0.08, -0.06)
     assert (three.psds[2].height, three.beams[2].angle, three.psds[2].axes) == (0.0, (0.0, 0.0), ('x', 'y'))
@@ -227,6 +220,7 @@ def assert_inside(records: Sequence[Record], truth: FloatArray) -> None:
     assert found.max() < 6.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('solver', 'more'), [('exact', LEVEL), ('pose', {})])
 @pytest.mark.parametrize(('fault', 'psd'), [(dark, 0), (saturated, 2)])
 def test_without_one_psd_the_estimate_goes_on_from_the_others(
@@ -252,6 +246,7 @@ def test_without_one_psd_the_estimate_goes_on_from_the_others(
     assert topics == {f'/psd_{n}/spot' for n in (1, 2, 3) if n != psd + 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('fault', 'psd'), [(stuck, 1), (inverted, 0), (inverted, 2)])
 def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     three: Rig, fault: Callable[[int], Spoil], psd: int
@@ -272,6 +267,7 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     assert np.mean(good) < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('psd', [0, 2])
 def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig, psd: int) -> None:
     records, truth, pipeline = run(three, inverted(psd))
@@ -281,6 +277,7 @@ def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig,
     assert pipeline.estimator.most_likely_wrong() == ''
 
 
+@pytest.mark.slow
 def test_a_stuck_psd_reports_on_itself_where_the_check_cannot(three: Rig) -> None:
     records, truth, _ = run(three, stuck(1))
     assert_inside(records, truth)
@@ -313,6 +310,7 @@ def test_reject_rejects_only_what_cannot_be_reported(three: Rig) -> None:
     assert pipeline.estimator.contradictions > 60
 
 
+@pytest.mark.slow
 def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
     def two_dark(counts: Counts) -> None:
         dark(0)(counts)
@@ -394,16 +392,6 @@ def test_a_recording_of_three_is_replayed_without_a_differing_bit(
     assert main(['replay', str(tmp_path / 'c.csv')]) == 3
     assert 'samples of 3 PSDs, the rig file has 2' in capsys.readouterr().err
     assert main(['replay', str(tmp_path / 'c.csv'), '--params-file', str(THREE)]) == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('command', ['check', 'calibrate'])
-def test_commands_for_two_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
-    words = ['--params-file', str(THREE), '--loads', 'constant:0,0,0:1']
-    assert main(['simulate', *words, '--out', str(tmp_path / 'a.csv')]) == 0
-    more = [] if command == 'check' else ['--out', str(tmp_path / 'out')]
-    assert main([command, str(tmp_path / 'a.csv'), '--params-file', str(THREE), *more]) == 3
-    assert 'takes rigs of two PSDs, this one has 3' in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -144,6 +144,7 @@ def imported(*folders: str) -> set[str]:
     return ros | {KEYS.get(n, f'python3-{n}') for n in names - ros}
 
 
+@pytest.mark.slow
 def test_package_xml_names_what_the_sources_import() -> None:
     root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
     runs, tests = ({e.text for e in root.iter(f'{kind}_depend')} for kind in ('exec', 'test'))

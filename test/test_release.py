@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,12 +14,7 @@ import pytest
 from tools.release import (
     MAKERS,
     TREE,
-    changelog_rst,
-    check_licences_of,
-    check_wheel,
-    facts,
     main,
-    rosdep_table,
 )
 
 pytestmark = pytest.mark.slow
@@ -151,64 +144,3 @@ def packed(wheel: Path, without: str = '\0') -> Path:
         archive.writestr('x.dist-info/licenses/LICENSE', '')
         archive.writestr('x.data/data/share/psd_deflection/package.xml', '')
     return wheel
-
-
-def test_a_wheel_without_the_page_is_noticed(tmp_path: Path) -> None:
-    assert list(check_wheel(ROOT, packed(tmp_path / 'whole.whl'))) == []
-    message = list(check_wheel(ROOT, packed(tmp_path / 'bare.whl', '/page/vendor/')))
-    assert message
-    assert all('lacks psd_deflection/base/page/vendor/' in line for line in message)
-
-
-def test_a_check_of_a_wheel_without_the_page_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With judges that find nothing."""
-    made = tmp_path
-    (made / 'dist').mkdir()
-    (made / 'dist/x.tar.gz').touch()
-    (made / 'build/release/bin').mkdir(parents=True)
-    for tool in ('twine', 'check-wheel-contents', 'zizmor', 'hadolint', 'python', 'pip-audit'):
-        (made / 'build/release/bin' / tool).symlink_to('/bin/true')
-    bom = made / 'build/release/bin/cyclonedx-py'
-    bom.write_text('#!/bin/sh\nfor last; do :; done; echo \'{"components": [1]}\' >"$last"\n')
-    bom.chmod(0o755)
-    subprocess.run([sys.executable, '-m', 'venv', '--without-pip', made / 'use'], check=True)
-    words = ['check', '--dist', made / 'dist', '--installed', made / 'use', '--tools', made / 'build/release']
-    for without, status in (('\0', 0), ('/page/', 1)):
-        packed(made / 'dist/x.whl', without)
-        assert main([str(w) for w in words], ROOT) == status
-    assert 'PROBLEM: x.whl: lacks psd_deflection/run/monitor/page/' in capsys.readouterr().out
-
-
-def test_a_copyleft_licence_among_what_is_installed_is_noticed(tmp_path: Path) -> None:
-    subprocess.run([sys.executable, '-m', 'venv', '--without-pip', tmp_path / 'use'], check=True)
-    python = tmp_path / 'use/bin/python'
-    info = next((tmp_path / 'use/lib').glob('python*')) / 'site-packages/strict-1.dist-info'
-    info.mkdir()
-    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: strict\nVersion: 1\nLicense: LGPL-3.0\n')
-    assert check_licences_of(python) == ([], [])
-    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: strict\nVersion: 1\nLicense: GPL-3.0\n')
-    assert check_licences_of(python) == (['strict 1: GPL-3.0'], [])
-
-
-def test_what_was_not_tried_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['check']) == 0
-    message = capsys.readouterr().out
-    assert 'not tried: what is built' in message
-    assert 'not tried: what only a release must have' in message
-    assert 'not tried: publishing' in message
-
-
-def test_the_changelog_of_bloom_has_the_text_of_the_other(tree: Path) -> None:
-    ready(tree)
-    made = changelog_rst(tree)
-    assert f'\n{facts(tree).version} (2026-12-01)\n------------------\n' in made
-    assert '\n  * ``estimator``: 1 kHz samples' in made
-    entries = sum(line.startswith('- ') for line in (tree / 'CHANGELOG.md').read_text().splitlines())
-    assert sum(line.startswith('  * ') for line in made.splitlines()) == entries
-    assert '](' not in made
-
-
-def test_the_table_of_keys_says_one_of_three_words() -> None:
-    for key, row in rosdep_table(ROOT).items():
-        assert set(row) == {'noble', 'resolute', 'bookworm'}, key
-        assert set(row.values()) <= {'apt', 'pip', 'none'}, key

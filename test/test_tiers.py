@@ -8,7 +8,7 @@ import ast
 from pathlib import Path
 
 from tools.mutants_by_hand import KINDS, hand_made
-from tools.tiers import ROOMS, holds, paths_of
+from tools.tiers import ROOMS
 
 ROOT = Path(__file__).parents[1]
 
@@ -28,13 +28,6 @@ def test_each_room_has_quick_tests_in_each_of_its_files() -> None:
             files = list(path.rglob('test_*.py')) or [path]
             slow = ['pytestmark = pytest.mark.slow' in file.read_text() for file in files]
             assert not all(slow) or str(path.relative_to(ROOT)) not in room.tests, path
-
-
-def test_a_room_is_a_folder_and_the_tests_of_its_mutants() -> None:
-    assert paths_of('measure') == ('test/measure',)
-    assert paths_of('averaging') == ('test/averaging', *ROOMS['averaging'].tests)
-    assert holds(('test/a', 'test/b.py'), 'test/a/test_it.py')
-    assert not holds(('test/a', 'test/b.py'), 'test/ab.py')
 
 
 def test_each_mutant_made_by_hand_changes_one_line_and_can_run() -> None:

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.base.charts import BUCKETS, Chart, Colour, Panel, Rule, Series, drawn
-from psd_deflection.base.drawings import BarColumn, Bars, Matrix, in_page
+from psd_deflection.base.charts import BUCKETS, Chart, Panel, Rule, Series, drawn
 from psd_deflection.base.pages import page, table
 from psd_deflection.records import FloatArray
 
@@ -121,22 +120,3 @@ def test_the_policy_of_a_page_lets_its_own_scripts_run_and_no_other() -> None:
     allowed = ' '.join(f"'sha256-{digest}'" for digest in digests)
     assert policy[1] == f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
     assert not re.search(r'^(import|export) ', scripts[1], flags=re.M)
-
-
-def test_bars_are_as_long_as_their_numbers() -> None:
-    names: list[str] = ['total', 'a <b>', 'nothing']
-    tones: list[Colour] = ['text', 'red', 'blue']
-    linear, log = BarColumn('x, µm', [2.0, 0.5, 0.0], 2.0), BarColumn('y', [1.0, 0.1, 1e-9], 1.0, 0.01)
-    text = in_page(Bars('what', names, tones, [linear, log], legend=[('known', 'red')]))
-    assert re.findall(r'--w:([\d.]+)', text) == ['1.0000', '1.0000', '0.2500', '0.5000', '0.0000', '0.0000']
-    assert 'a &lt;b&gt;' in text
-    assert re.findall(r'</i>([^<]+)<', text) == ['2', '1', '0.5', '0.1', '0', '1e-09']
-    assert '--tone:var(--red)">known' in text
-
-
-def test_cells_of_a_matrix_are_as_dark_as_their_values() -> None:
-    values = np.array([[1.0, 1.0, -0.5], [np.nan, 0.0, 2.0]])
-    text = in_page(Matrix('what', values, ['r1', 'r2'], ['a', 'b', 'c'], most=1.0))
-    paths = re.findall(r'style="fill:var\(--(\w+)\)" fill-opacity="([\d.]+)" d="([^"]+)"', text)
-    assert paths == [('red', '0.50', 'M2 0h1v1h-1z'), ('blue', '1.00', 'M0 0h2v1h-2zM2 1h1v1h-1z')]
-    assert re.findall(r'>([abc]|r\d)</text>', text) == ['r1', 'r2', 'a', 'b', 'c']

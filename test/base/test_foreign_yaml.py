@@ -144,6 +144,7 @@ WORDS = 'a 1 : - [ ] { } , &x *x <<: !!int !!bool !!set !!timestamp !!float " 0x
 PIECES = st.sampled_from(WORDS.split(' '))
 
 
+@pytest.mark.slow
 @given(st.lists(PIECES | st.sampled_from([' ', '  ', '\n', '\t']) | st.text(max_size=3), max_size=30).map(''.join))
 def test_any_text_is_read_or_rejected(text: str) -> None:
     with contextlib.suppress(YamlError):

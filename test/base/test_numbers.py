@@ -22,14 +22,6 @@ from psd_deflection.rig.config import load_rig
 PACKAGE = Path(psd_deflection.__file__).parent
 ODD = ['-1_0', '1_000', '٣', '１', '0x10', '1e', '', 'one', '1 2']
 
-ALLOWED = {
-    # Whole columns at once, after the same test of their characters.
-    'recordings/read/csv_reader.py',
-    # Of our own files.
-    'recordings/read/bag_reader.py',
-    'run/monitor/served.py',
-}
-
 
 @pytest.mark.parametrize('text', ODD)
 def test_what_is_no_number_is_rejected(text: str) -> None:
@@ -65,18 +57,6 @@ def test_parameters_options_loads_frames_and_arms_reject_it(text: str, tmp_path:
     with pytest.raises(ConfigError, match='must be 1 finite number'):
         read_arm(urdf, 'tool')
     assert main(['load', '--url', 'http://127.0.0.1:1/', '--', '0', text, '0']) == 2
-
-
-def test_a_text_is_made_a_number_in_one_place() -> None:
-    found = []
-    for path in sorted(PACKAGE.rglob('*.py')):
-        name = str(path.relative_to(PACKAGE))
-        if name in ALLOWED or name == 'base/numbers.py':
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            for call in _readings(node):
-                found.append(f'{name}:{call.lineno}: {ast.unparse(call)}')
-    assert not found, 'read texts by base.numbers.plain_number: ' + '; '.join(found)
 
 
 def _readings(node: ast.AST) -> list[ast.expr]:

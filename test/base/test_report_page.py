@@ -81,6 +81,7 @@ def values(page: Page) -> dict[str, str]:
     return {name: value.replace('−', '-') for name, value in found}
 
 
+@pytest.mark.slow
 def test_every_plot_says_its_values_under_one_cursor(page: Page) -> None:
     move(page, 'c0p0', 0.252)
     page.until(f'{KEYS}[0].querySelector("output").textContent !== ""')
@@ -99,16 +100,6 @@ def test_in_a_gap_there_is_no_value(page: Page) -> None:
     move(page, 'c0p0', 0.5)
     page.until(f'{KEYS}[0].querySelector("output").textContent !== ""')
     assert values(page)['c0p0 after'] == ''
-
-
-def test_of_points_above_each_other_the_one_under_the_cursor_speaks(page: Page) -> None:
-    # From -5 to 99 with a margin of 6 %: the lower points hang at 0, the upper ones at 10.
-    for across, up, low, high in ((0.02, 0.15, 0, 20), (0.02, 0.45, 35, 49), (0.98, 0.9, 80, 99)):
-        move(page, 'c1p0', across, up)
-        page.until(f'{KEYS}.find((k) => k.dataset.name === "missing").querySelector("output").textContent !== ""')
-        assert low <= float(values(page)['c1p0 missing']) <= high
-    move(page, 'c1p0', 0.5, 0.5)
-    page.until(f'{KEYS}.find((k) => k.dataset.name === "missing").querySelector("output").textContent === ""')
 
 
 DRAWN = """((plot, tone) => {
@@ -143,6 +134,7 @@ def test_a_key_switches_its_curve_in_every_plot(page: Page) -> None:
     page.until(f'{DRAWN}("c0p1", "red") > 50')
 
 
+@pytest.mark.slow
 def test_a_drag_looks_closer_in_all_plots_of_one_axis_and_a_button_goes_back(page: Page) -> None:
     full = 'document.querySelector("button.whole").checkVisibility()'
     assert not page.js(full)
@@ -163,21 +155,6 @@ def test_a_drag_looks_closer_in_all_plots_of_one_axis_and_a_button_goes_back(pag
     page.until('parseFloat(document.querySelector("output.at[data-plot=c0p0]").textContent) > 90')
 
 
-def test_a_finger_looks_closer(page: Page) -> None:
-    over = page.driver.find_element(By.CSS_SELECTOR, '#plot_c0p0 .u-over')
-    page.js('arguments[0].scrollIntoView({block: "center"})', over)
-    box = page.js('arguments[0].getBoundingClientRect().toJSON()', over)
-    at = [(box['x'] + share * box['width'], box['y'] + box['height'] / 2) for share in (0.2, 0.3, 0.4)]
-    page.driver.execute_cdp_cmd('Emulation.setTouchEmulationEnabled', {'enabled': True})
-    try:
-        for kind, places in (('touchStart', at[:1]), ('touchMove', at[1:2]), ('touchMove', at[2:]), ('touchEnd', [])):
-            points = [{'x': x, 'y': y} for x, y in places]
-            page.driver.execute_cdp_cmd('Input.dispatchTouchEvent', {'type': kind, 'touchPoints': points})
-        page.until('document.querySelector("button.whole").checkVisibility()')
-    finally:
-        page.driver.execute_cdp_cmd('Emulation.setTouchEmulationEnabled', {'enabled': False})
-
-
 def test_the_keyboard_moves_the_cursor_and_looks_closer(page: Page) -> None:
     plot = page.driver.find_element(By.ID, 'plot_c0p0')
     at = 'parseFloat(document.querySelector("output.at[data-plot=c0p0]").textContent)'
@@ -196,6 +173,7 @@ def test_the_keyboard_moves_the_cursor_and_looks_closer(page: Page) -> None:
     assert page.js('document.activeElement.id') == 'plot_c0p0'
 
 
+@pytest.mark.slow
 def test_a_chart_in_closed_details_is_drawn_when_they_open(page: Page) -> None:
     page.driver.find_element(By.TAG_NAME, 'summary').click()
     page.until('document.querySelectorAll(".uplot").length === 6')
@@ -203,6 +181,7 @@ def test_a_chart_in_closed_details_is_drawn_when_they_open(page: Page) -> None:
     page.driver.find_element(By.ID, 'plot_c2p1').send_keys(Keys.ARROW_RIGHT, '+', '0')
 
 
+@pytest.mark.slow
 def test_the_charts_are_accessible_and_no_wider_than_a_phone(page: Page) -> None:
     page.js('document.querySelector("details").setAttribute("open", "")')
     found = []
@@ -215,5 +194,6 @@ def test_the_charts_are_accessible_and_no_wider_than_a_phone(page: Page) -> None
     assert found == []
 
 
+@pytest.mark.slow
 def test_a_report_asks_for_nothing(page: Page) -> None:
     assert page.js('performance.getEntriesByType("resource").map((e) => e.name)') == []

@@ -29,6 +29,7 @@ def test_a_column_may_have_words_numbers_and_none() -> None:
     assert values.tolist() == [(1.0, 2.0), -1.0, None]
 
 
+@pytest.mark.slow
 def test_xarray_has_the_units() -> None:
     pytest.importorskip('xarray')
     data = TABLE.to_xarray()

@@ -4,12 +4,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from bench import cpu, limits, page
-from bench.rows import ROOT, Row, figure, keep, read
+from bench import cpu, page
+from bench.rows import ROOT, Row, figure, read
 
 pytestmark = pytest.mark.slow
 
@@ -29,26 +27,6 @@ def test_ratios_and_bounds_are_those_of_peers_and_limits() -> None:
     ]
 
 
-def test_a_row_in_which_outside_load_shows_is_not_judged() -> None:
-    steady, torn = figure('mine', 'ours', [1.0, 1.1, 0.9]), figure('least', 'limit', [1.0, 1.0, 1.6], 0.5)
-    message = 'not judged: quartiles 30 % apart, load from outside'
-    assert Row('work', 's', [steady, torn]).verdict(torn) == message
-    assert page.lines_of(Row('work', 's', [steady, torn]))[0].endswith(f': {message}) |')
-    once = figure('least', 'limit', [1.0], 0.5)
-    assert Row('work', 's', [steady, once]).verdict(once) == 'not met'
-    assert Row('work', 's', [figure('mine', 'ours', [1.0, 1.0, 1.6]), once]).verdict(once) == message
-    assert Row('work', 's', [steady, figure('least', 'limit', [1.0])]).verdict(figure('least', 'limit', [1.0])) == ''
-
-
-def test_a_row_replaces_the_older_one_of_its_work(tmp_path: Path) -> None:
-    path = tmp_path / 'results.json'
-    keep([Row('a', 's', [figure('x', 'ours', [1.0])]), Row('b', 's', [figure('x', 'ours', [1.0])])], path)
-    keep([Row('a', 's', [figure('x', 'ours', [2.0])])], path)
-    rows, machine = read(path)
-    assert [(row.work, row.figures[0].median) for row in rows] == [('a', 2.0), ('b', 1.0)]
-    assert machine['versions']['numpy']
-
-
 def test_the_page_is_made_of_the_results() -> None:
     assert page.PAGE.read_text(encoding='utf-8') == page.page(*read(), *read(cpu.RESULTS))
     assert '<!--' not in page.PAGE.read_text(encoding='utf-8')
@@ -56,11 +34,3 @@ def test_the_page_is_made_of_the_results() -> None:
     text = page.README.read_text(encoding='utf-8')
     assert page.readme(text, read()[0]) == text
     assert sum(line.endswith(page.PRINTED_BY) for line in text.split('\n')) == 3
-
-
-@pytest.mark.parametrize('rows', [lambda: limits.frames(1), lambda: limits.simulation(1)], ids=['frames', 'simulation'])
-def test_a_row_can_be_measured(rows: object) -> None:
-    assert callable(rows)
-    for row in rows():
-        assert row.figures[0].kind == 'ours'
-        assert {f.kind for f in row.figures} == {'ours', 'peer', 'limit'}

@@ -4,34 +4,25 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from blind import generator, run, score, suite_peers
+from blind import generator, run, score
 from blind.cases import (
     DRAWS,
     EFFECTS,
-    MISTAKES,
     NOISES,
     Case,
-    all_cases,
     cases_by_hand,
     designs,
-    gap_of,
-    scaled,
     short_cases,
 )
 from blind.generator import LINK
-from blind.mistakes import observed
 from psd_deflection.model.simulation.catalogue import make_active, sort_effects
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.discover.observation import Observation
 
 pytestmark = pytest.mark.slow
 
@@ -73,21 +64,6 @@ def test_both_generators_show_two_effects_of_the_link_alike(first: str) -> None:
         assert np.abs(g.clean(pair) - ours).max() < 2e-6 + 1e-5 * moved, second
 
 
-@pytest.mark.repeatable
-def test_a_case_has_the_gap_it_says() -> None:
-    effect = scaled(1, 'sensor_gain', 3.0, designs('one'))
-    assert gap_of(designs('one'), effect) == pytest.approx(3.0, rel=0.04)
-    assert scaled(1, 'sensor_gain', 3.0, designs('one')) == effect
-
-
-def test_cases_are_many_and_each_its_own() -> None:
-    cases = list(all_cases())
-    assert len({c.key for c in cases}) == len(cases)
-    assert len({c.seed for c in cases}) == len(cases)
-    assert sum(c.kind == 'null' for c in cases) >= 300
-    assert len({c.wanted[0][0] for c in cases if c.kind == 'single'}) >= 25
-
-
 @pytest.mark.parametrize('key', ['single-sensor_rotation-3-s', 'single-plane_tilt-3-s', 'single-quantisation-3-s'])
 def test_a_hidden_effect_is_named(key: str) -> None:
     case = next(c for c in short_cases() if c.key == key)
@@ -106,61 +82,10 @@ def test_times_at_the_noise_stay_beside_a_nonlinear_effect() -> None:
     assert found.floors < 1.05
 
 
-def test_no_case_has_an_effect_that_no_machine_can_have() -> None:
-    """Loads that are applied slowly show little of a second mode."""
-    by_key = {c.key: c for c in cases_by_hand(68000, 110)}
-    assert run.truth_of(by_key['hand-slow-68082-second_bending_mode']) == []
-    (mode,) = run.truth_of(by_key['hand-cell-68097-second_bending_mode'])
-    assert mode['gain'] == pytest.approx(0.00188, rel=0.05)
-
-
 @pytest.mark.parametrize('noise', ['white', *NOISES])
 def test_nothing_is_missing_from_noise_of_any_kind(noise: str) -> None:
     answer, _ = run.answer(Case(f'slice-{noise}', 'null', 'one', (), noise=noise), [])
     assert answer['verdict'] == 'nothing_missing'
-
-
-def test_a_run_seals_answers_resumes_and_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ['--short', '--only', 'null-s0', '--out', str(tmp_path)]
-    # One null cannot meet every threshold's count of cases, but breaks none either.
-    assert run.main(words) == 0
-    answer = tmp_path / 'answers' / 'null-s0.json'
-    first = answer.read_text()
-    sealed = (tmp_path / 'seal.sha256').read_text()
-    assert run.main(words) == 0
-    assert answer.read_text() == first
-    assert (tmp_path / 'seal.sha256').read_text() == sealed
-    assert 'false alarm, right noise: 0.0 % (0/1' in capsys.readouterr().out
-    tree = json.loads(first)
-    tree['verdict'] = 'effects_found'
-    answer.write_text(json.dumps(tree))
-    assert run.main([*words, '--score']) == 1
-    assert 'null-s0: truth nothing' in capsys.readouterr().out
-
-
-def test_every_mistake_has_five_sizes_and_changes_the_recording() -> None:
-    (g,) = designs('one')
-    rig = load_rig()
-    sound = Observation('recording 1', rig, g.record([], 'white', 1), g.loads, g.temperature)
-    for name, sizes in MISTAKES.items():
-        assert len(sizes) == 5
-        visited = observed((name, sizes[0]), g, rig, 'white', 1)
-        same = [
-            o.rig.values == rig.values and np.array_equal(o.volts, sound.volts) and np.array_equal(o.loads, sound.loads)
-            for o in visited
-        ]
-        assert not all(same), name
-
-
-def test_a_mistake_is_named_and_no_effect_beside_it() -> None:
-    case = next(c for c in short_cases() if c.kind == 'mistake')
-    answer, _ = run.answer(case, [])
-    row = score.Row(case.key, case.kind, 0.0, True, [], answer, case.mistake[0])
-    text, _ = score.summary([row])
-    assert 'mistake of the set-up named, and nothing else: 100.0 % (1/1' in text
-    assert answer['verdict'] == 'nothing_missing'
-    worse = score.Row(case.key, 'null', 0.0, True, [], answer)
-    assert 'mistake named where there is none: 100.0 % (1/1' in score.summary([worse])[0]
 
 
 def test_an_unnoted_torque_beside_a_soft_link_has_its_time() -> None:
@@ -211,40 +136,6 @@ def test_a_false_effect_fails_the_suite_unless_equivalent() -> None:
     alike = score.complete({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
     row = score.Row('single', 'single', 3.0, True, [{'name': 'mount_tilt'}], alike)
     assert 'an effect named that is none: 0.0 % (0/1;' in score.summary([row])[0]
-
-
-@pytest.mark.parametrize('peer', ['subsets', 'stlsq'])
-def test_a_peer_answers_the_same_cases(peer: str) -> None:
-    if peer == 'stlsq':
-        pytest.importorskip('pysindy')
-    for name in ('single-creep-3-s', 'null-s0', 'single-quantisation-3-s'):
-        case = next(c for c in short_cases() if c.key == name)
-        found = suite_peers.answer(peer, run.observe(case, run.truth_of(case)), load_rig(), ())
-        row = score.Row(case.key, case.kind, 3.0, True, run.truth_of(case), score.complete(found))
-        assert row.named == [n for n, _ in case.wanted], name
-        assert row.answer['remaining']['floors'] < 1.1
-
-
-def test_no_answer_is_taken_for_that_of_another_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / 'answers').mkdir()
-    (tmp_path / 'answers' / 'null-s0.json').write_text(json.dumps({'effects': [{'name': 'creep'}]}))
-    message = {'effects': [], 'remaining': {'floors': 1.0}}
-    monkeypatch.setattr(suite_peers, 'answer', lambda *given: message if given[0] == 'subsets' else {})
-    run.main(['--short', '--only', 'null-s0', '--peer', 'subsets', '--out', str(tmp_path)])
-    assert json.loads((tmp_path / 'answers-subsets' / 'null-s0.json').read_text())['effects'] == []
-    assert 'false alarm, right noise: 0.0 % (0/1' in (tmp_path / 'summary-subsets.txt').read_text()
-    run.main(['--score', '--out', str(tmp_path)])
-    assert 'false alarm, right noise: 100.0 % (1/1' in (tmp_path / 'summary.txt').read_text()
-
-
-def test_a_peer_that_is_not_installed_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-    with pytest.raises(SystemExit):
-        run.main(['--short', '--peer', 'stlsq', '--out', str(tmp_path)])
-    assert '--peer stlsq: PySINDy is not installed: pip install pysindy' in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
 
 
 def test_intervals_are_clopper_and_pearsons() -> None:

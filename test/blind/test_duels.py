@@ -6,17 +6,13 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from blind import balls, silverbox
-from blind.boom import Boom
-from blind.duel_peers import best_subset
-from blind.measured import DATA
-from blind.silverbox import RATE, Silverbox, rmse
+from blind import silverbox
+from blind.silverbox import RATE, Silverbox
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plant_search import discover_in
 
@@ -65,58 +61,3 @@ def test_the_cubic_spring_of_a_made_silverbox_is_found_with_its_size(tmp_path: P
     assert spring.active.values['stiffening'] == pytest.approx(CUBIC, rel=0.05)
     # The noise that was added, and little more, is left.
     assert 0.9e-4 < found.gap_after < 2e-4
-
-
-def made_drops(path: Path, drag: float) -> None:
-    """Two drops of each ball from 47 m, falling as v = -u tanh(g t / u), in the file's form; u by mass and radius."""
-    sheet = '<worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"><sheetData>'
-    sheets = []
-    with ZipFile(path, 'w') as book:
-        for number, (name, (ounces, around)) in enumerate(balls.BALLS.items(), start=1):
-            area = math.pi * (0.01 * around / (2.0 * math.pi)) ** 2
-            last = math.sqrt(2.0 * balls.OUNCE * ounces * 9.81 / (1.2 * area * drag))
-            t = np.arange(40) / 15.0
-            h = 47.0 - last**2 / 9.81 * np.log(np.cosh(9.81 * t / last))
-            rows = [(d, *pair) for d in (1, 2) for pair in zip(t.tolist(), h.tolist(), strict=True)]
-            text = ''.join(
-                '<row>' + ''.join(f'<c><v>{v!r}</v></c>' for v in row) + '</row>' for row in [(0, 0, 0), *rows]
-            )
-            book.writestr(f'xl/worksheets/sheet{number}.xml', f'{sheet}{text}</sheetData></worksheet>')
-            sheets.append(f'<sheet name="{name}"/>')
-        head = '<workbook xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"><sheets>'
-        book.writestr('xl/workbook.xml', f'{head}{"".join(sheets)}</sheets></workbook>')
-
-
-def test_the_drag_of_made_drops_is_found_with_its_size(tmp_path: Path) -> None:
-    """By the closed form of a fall with drag that grows with the square of speed."""
-    made_drops(tmp_path / balls.FILE, 0.45)
-    (drag,) = discover_in(balls.Balls(tmp_path)).effects
-    assert drag.active.effect.name == 'quadratic_drag'
-    assert drag.active.values['coefficient'] == pytest.approx(0.45, rel=0.05)
-
-
-@pytest.mark.skipif(not (DATA / 'boom').is_dir(), reason='the readings of the boom are not here')
-def test_of_the_boom_every_subset_of_three_is_asked() -> None:
-    subset = best_subset(Boom())
-    assert set(subset.names) == {'self_weight', 'tip_force', 'root_length'}
-    assert 1e3 * subset.gap == pytest.approx(1.58, abs=0.02)
-    assert subset.gap < subset.unseen < 3e-3
-
-
-@pytest.mark.skipif(not (DATA / 'silverbox').is_dir(), reason='the data of the Silverbox are not here')
-def test_the_fitted_silverbox_is_simulated_to_half_a_percent() -> None:
-    """The search itself takes minutes: python -m blind.duels --only silverbox."""
-    plant = Silverbox(DATA / 'silverbox')
-    model = {
-        'cubic_spring': {'stiffening': 3.944},
-        'quadratic_drag': {'drag': 0.0192},
-        'quadratic_spring': {'bend': -0.1003},
-        'reading_offset': {'shift': -0.005515},
-        'frequency': {'scale': -0.017107},
-        'damping': {'scale': -0.00165},
-        'gain': {'scale': 0.02988},
-    }
-    first, last = silverbox.TESTS['multisine']
-    residual, share = rmse(plant.y[first:last], plant.run(model, np.array([first]), last - first)[:, 0])
-    assert 1e3 * residual < 0.25
-    assert share < 0.005

@@ -6,40 +6,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from blind import law_forms
 from blind.cases import designs, gap_of
-from blind.laws import drawn, evaluated, observe, sized, summary
-from psd_deflection.studies.discover.laws.laws import find_law
-from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.workspace import Workspace
+from blind.laws import drawn, evaluated, sized
 
 pytestmark = pytest.mark.slow
-
-
-def test_laws_are_drawn_over_stages_and_forms_and_each_is_its_own() -> None:
-    laws = drawn(40, 24)
-    assert drawn(40, 24) == laws
-    assert {law['name'] for law in laws} == {f'law_{s}' for s in law_forms.OF_STAGE}
-    assert len({law['form'] for law in laws}) >= 10
-    assert len({str(law) for law in laws}) == 24
-    for law in laws:
-        assert law['form'] in law_forms.OF_STAGE[law['name'].removeprefix('law_')]
-        assert law_forms.truth_of(law)['variables']
-
-
-@pytest.mark.parametrize('stage', law_forms.OF_STAGE)
-def test_each_form_of_a_stage_changes_the_readings(stage: str) -> None:
-    t = np.arange(5000) / 5000.0
-    known = {n: np.sin(7.0 * t) * full for n, full in law_forms.FULL.items()}
-    for form in law_forms.OF_STAGE[stage]:
-        law = {**law_forms.draw(3, stage, form), 'times': [0.2, 0.5] if 'events' in form else []}
-        if form != 'jitter':
-            out = law_forms.added(law, known, t, 1.0 / 5000.0)
-            assert np.all(np.isfinite(out)), form
-            assert np.ptp(out) > 0.01, form
 
 
 def test_a_law_has_the_gap_it_says() -> None:
@@ -66,11 +39,6 @@ def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
     assert (row['stage'], row['variables'], row['law'], row['floors']) == (False, False, None, pytest.approx(5.0))
     assert evaluated(None, reported())['alarm']
     assert not evaluated(None, {**reported(), 'unknown': []})['alarm']
-
-
-def test_a_law_that_never_acts_is_drawn_anew() -> None:
-    law = next(law for law in drawn(396, 12) if law['number'] == 400)
-    assert gap_of(designs('one'), sized(law)) == pytest.approx(law['gap'], rel=0.1)
 
 
 def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
@@ -111,28 +79,3 @@ def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -
         row = evaluated(law, {**nothing, 'setup': message})
         assert (row['stage'], row['note']) == (False, False)
     assert not evaluated(truth, {**reported(stage='psd'), 'setup': found})['note']
-
-
-def test_a_threshold_that_is_missed_is_reported() -> None:
-    truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
-    good = {**evaluated(truth, reported()), 'seconds': 1.0}
-    assert summary([good] * 10) == (summary([good] * 10)[0], True)
-    assert not summary([good] * 8 + [{**good, 'stage': False}] * 2)[1]
-    assert not summary([good] * 7 + [{**good, 'floors': 1.3}] * 3)[1]
-    text, passed = summary([good, {'alarm': True}])
-    assert not passed
-    assert 'MISS laws where nothing is missing: 1/1' in text
-
-
-def test_a_drawn_law_is_found_on_its_stage_with_its_variables() -> None:
-    law = next(law for law in drawn(40, 12) if law['name'] == 'law_link')
-    truth = law_forms.truth_of(law)
-    ws = Workspace(observe(sized(law), 40))
-    null = refit(ws, ())
-    excess = 0.5 * (null.chi2 - ws.size)
-    rng = np.random.default_rng(0)
-    found = find_law(ws, null, null, float(np.log(ws.effective_size())), excess, rng, lambda _: None)
-    assert found is not None
-    assert truth['stage'] in {found.law.stage, *(e.stage for e in found.equivalent)}
-    assert sorted(found.law.variables) == truth['variables']
-    assert found.heldout_gap < 1.2 * ws.floor()

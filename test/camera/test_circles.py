@@ -60,6 +60,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', SCENES)
 def test_a_rendered_motion_is_found_again(name: str) -> None:
     moved = [Pose(3e-3, -2e-3, 0.05, 0.01, -0.008), Pose(-4e-3, 3e-3, 0.3, -0.01, 0.01)]
@@ -78,6 +79,7 @@ def test_a_tilt_of_the_plate_is_observed_and_does_not_turn_theta() -> None:
     assert [answer.phi, answer.omega] == pytest.approx([0.12, -0.1], abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('tilt', [(0.0, 0.0), (0.1, -0.08)], ids=['frontal', 'from the side'])
 def test_without_a_lens_what_is_reported_of_the_error_is_its_size(tilt: tuple[float, float]) -> None:
     """The mirrored tilt is no error of dX, dY or theta, and perspective is seen without knowing the focal length."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
-from psd_deflection.camera.footage import Footage, of_ros_image, read_settings
+from psd_deflection.camera.footage import Footage, read_settings
 
 
 def folder(path: Path, table: str) -> str:
@@ -74,18 +74,6 @@ def test_a_video_is_stamped_by_its_frames(tmp_path: Path) -> None:
     frames = list(Footage(path, 0.01))
     assert [f.t_ns for f in frames] == [5_000_000, 45_000_000, 85_000_000]
     assert [round(f.image.mean(), -1) for f in frames] == [10.0, 100.0, 200.0]
-
-
-def test_images_of_ros_become_grey() -> None:
-    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    padded = np.pad(grey, ((0, 0), (0, 3))).tobytes()
-    assert np.array_equal(of_ros_image(3, 4, 'mono8', False, 7, padded), grey)
-    deep = (grey.astype('>u2') * 257).tobytes()
-    assert np.array_equal(of_ros_image(3, 4, '16UC1', True, 8, deep), grey.astype(np.uint16) * 257)
-    colour = np.repeat(grey[..., None], 3, axis=2).tobytes()
-    assert np.array_equal(of_ros_image(3, 4, 'rgb8', False, 12, colour), grey)
-    assert of_ros_image(3, 4, '32FC1', False, 16, bytes(48)) is None
-    assert of_ros_image(3, 4, 'mono8', False, 7, padded[:-1]) is None
 
 
 @pytest.mark.parametrize(

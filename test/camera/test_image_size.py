@@ -135,6 +135,7 @@ def test_a_frame_without_a_target_does_not_wait_for_the_rest() -> None:
     assert reference.finish() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('square', [1, 2, 3, 5])
 def test_a_board_of_tiny_squares_costs_a_bounded_time(square: int) -> None:
     y, x = np.mgrid[:1400, :1400]

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,16 +13,12 @@ import pytest
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
-from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs.find_discs import find_discs
-from psd_deflection.camera.discs.rim_classifier import sectors_of
-from psd_deflection.camera.discs.rim_model import Shape, moved, rotation_matrix
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.image_size import declared_size
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings, settings_from
-from psd_deflection.camera.targets import target_of
 
 
 def segment(marker: int, body: bytes) -> bytes:
@@ -96,35 +91,6 @@ def test_sixteen_bits_are_in_the_order_that_is_reported() -> None:
     assert of_ros_image(2, 2, 'yuv422', False, 4, bytes(8)) is None
 
 
-def test_a_rim_has_sixteen_parts_of_equal_angle() -> None:
-    angle = (np.arange(1600) + 0.5) * 2.0 * math.pi / 1600
-    side = (np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32))
-    rims = cast(Any, SimpleNamespace(begin=np.array([0, 1600])))
-    _, counts = np.unique(sectors_of(side, rims), return_counts=True)
-    assert counts.tolist() == [100] * 16
-    # Each part is of one piece.
-    changes = np.count_nonzero(np.diff(sectors_of(side, rims)))
-    assert changes == 15
-
-
-def test_a_fit_stays_within_its_bounds() -> None:
-    shape = Shape(np.eye(3), np.array([0.0, 0.0, 1.0]), 1.0, np.eye(2), np.zeros(0), np.zeros((3, 6)), np.zeros(0))
-    light = np.ones((3, 6))
-    step = np.zeros(10)
-    step[3:6] = 0.1, 0.2, 0.3
-    step[6:] = 0.9, 2000.0, 0.0, -5.0
-    found = moved(shape, step, light)
-    assert found.place == pytest.approx([0.1, 0.2, 1.3])
-    assert found.swell == 1.4
-    large, small = np.diag(found.blur)
-    assert large == 900.0
-    assert 0.0 < small < 0.1
-    assert moved(shape, -0.01 * np.ones(10), light).blur == pytest.approx(np.eye(2) - 0.01)
-    # A quarter of a pixel is as sharp as it gets.
-    step[7:] = 0.0, 0.0, -0.97
-    assert np.diag(moved(shape, step, light).blur) == pytest.approx([1.0, 0.0625])
-
-
 def test_a_lens_is_reported_with_the_deviation_of_each_number() -> None:
     matrix = np.array([[1000.0, 0.0, 320.0], [0.0, 1001.0, 240.0], [0.0, 0.0, 1.0]])
     made = Intrinsics((640, 480), matrix, np.array([1.0, 2.0, 3.0, 4.0]), np.zeros(5), 0.1, 12, [])
@@ -147,20 +113,6 @@ def test_a_board_has_up_to_a_thousand_columns(columns: int, right: bool) -> None
     else:
         with pytest.raises(ConfigError, match=f'target.columns = {columns}'):
             settings_from({'target.columns': columns}, 'x')
-
-
-@pytest.mark.parametrize('view', ['outside', 'base'])
-def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
-    board = target_of(CameraSettings(target='charuco', view=view))
-    assert isinstance(board, Board)
-    plane = np.stack(np.meshgrid(np.linspace(-0.03, 0.03, 6), np.linspace(-0.04, 0.04, 8)), axis=-1).reshape(-1, 2)
-    facing = np.diag([1.0, -1.0, -1.0]) if view == 'outside' else np.eye(3)
-    true = facing @ rotation_matrix(np.array([0.2, -0.3, 0.4]))
-    at = np.array([0.01, -0.02, 0.5])
-    observed = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
-    rotation, place = board.first_pose(plane, observed[:, :2] / observed[:, 2:])
-    assert rotation == pytest.approx(true, abs=1e-9)
-    assert place == pytest.approx(at, abs=1e-9)
 
 
 @pytest.mark.parametrize(('thick', 'why'), [(1, Status.MISSING), (2, Status.OBLIQUE)])
@@ -187,12 +139,3 @@ def test_a_rest_that_does_not_come_is_given_up_behind_as_many_frames(rest_frames
     answers = reference.take(last, hidden)
     assert [a.t_ns for a in answers] == list(range(last + 1))
     assert [a.status for a in answers] == [Status.OK] + [Status.HIDDEN] * last
-
-
-def test_as_many_frames_are_the_rest_as_are_asked_for() -> None:
-    still = TargetPose(np.eye(3), np.array([0.0, 0.0, 1.0]), 1e-12 * np.eye(6), 0.0, 10, np.zeros((3, 2)))
-    target = SimpleNamespace(locate=lambda *_: still, set_rest=lambda _: None)
-    reference = CameraReference(CameraSettings(rest_frames=500), lambda _: cast(Any, target))
-    image = np.zeros((20, 20), dtype=np.uint8)
-    assert [reference.take(i, image) for i in range(499)] == [[]] * 499
-    assert len(reference.take(499, image)) == 500

@@ -13,44 +13,12 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.model.link import LinkStatics
-from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.budget.chain import MeasuringChain, measure
 from psd_deflection.studies.budget.evaluate import CAUSES
 from psd_deflection.studies.budget.inputs import INPUTS
 
 pytestmark = pytest.mark.slow
 
 RIG = str(Path(__file__).parent.parent.parent / 'config' / 'thesis_rig.yaml')
-
-
-def test_the_table_has_every_term_and_the_totals_add_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(['budget', '--params-file', RIG, '--monte-carlo', '2000']) == 0
-    out = capsys.readouterr().out
-    rows = {line.split()[0]: line.split() for line in out.splitlines() if line}
-    for cause in CAUSES:
-        assert cause.name in rows
-    parts = [
-        [float(v) for v in next(line for line in out.splitlines() if line.startswith(f'all {kind}')).split()[-3:]]
-        for kind in ('per estimate', 'systematic', 'known bias')
-    ]
-    total = [float(v) for v in next(line for line in out.splitlines() if line.startswith('total')).split()[-3:]]
-    for column, integer in zip(zip(*parts, strict=True), total, strict=True):
-        # Root sum of squares, to the printed digits and the small biases that systematic terms have.
-        assert integer == pytest.approx(sum(v**2 for v in column) ** 0.5, rel=0.01)
-    assert 'Monte Carlo, 2000 draws' in out
-    # Nothing is written unasked.
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_chart_is_drawn_if_it_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    chart = tmp_path / 'chart.png'
-    assert main(['budget', '--params-file', RIG, '--out', str(chart)]) == 0
-    assert capsys.readouterr().out.rstrip().endswith(str(chart))
-    assert chart.read_bytes().startswith(b'\x89PNG')
 
 
 def test_the_page_has_a_bar_for_every_cause_and_the_same_numbers(tmp_path: Path) -> None:
@@ -75,30 +43,6 @@ link: {length: 0.8, outer_radius: 0.006, inner_radius: 0.0045, youngs_modulus: 2
     psd_1: {center: [0.0, 0.05], active_area: [0.004, 0.004], zero: [0.0005, -0.0005]}
     psd_2: {center: [-0.06, 0.0]}
 """
-
-
-def test_the_default_load_fits_the_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / 'rig.yaml'
-    path.write_text(f'/**:\n  ros__parameters:\n    {SMALL}')
-    assert main(['budget', '--params-file', str(path), '--json']) == 0
-    load = json.loads(capsys.readouterr().out)['load']
-    assert load[1] < 0.0
-    assert load == [0.0, load[1], pytest.approx(0.8 * load[1])]
-    # A dot moves half of the way to its edge, to two figures of the load.
-    rig = load_rig(path)
-    places, zeros = measure(MeasuringChain.of(rig), np.array(LinkStatics.from_rig(rig).deflection(*load)))
-    moved = np.abs(places[0] - zeros[0]) / (np.array([[0.002], [0.005]]) - np.sign(places[0] - zeros[0]) * zeros[0])
-    assert 0.45 < moved.max() < 0.51
-    # The same load is taken where the design leaves k free.
-    assert main(['design', '--params-file', str(path)]) == 0
-    assert f'tilts tied, k free, at {-load[1]:g} N ' in capsys.readouterr().out
-
-
-def test_the_thesis_rig_keeps_its_load(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    noisy = tmp_path / 'rig.yaml'
-    noisy.write_text('/**:\n  ros__parameters:\n    amplifier: {noise: 0.001}\n')
-    assert main(['budget', '--params-file', str(noisy)]) == 0
-    assert capsys.readouterr().out.startswith('Load (0 N, -50 N, -29.25 N m): ΔX 0.0000 mm, ')
 
 
 def test_a_rig_without_room_says_which_dot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,16 +5,14 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from blind.render import Pose, Scene, photograph, pixel_of
+from blind.render import Pose, Scene, photograph
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.read.readers import open_recording
 
 POSES = [Pose(), Pose(), Pose(1e-3, -2e-3, 0.02), Pose(-2e-3, 1e-3, -0.01)]
 
@@ -52,43 +50,6 @@ def test_the_table_has_each_frame_with_its_answer_or_reason(
     for row, pose in zip((r for r in rows if r['status'] == 'ok'), POSES, strict=True):
         for name in ('dx', 'dy', 'theta'):
             assert abs(float(row[name]) - getattr(pose, name)) < 5 * float(row[f'sd_{name}'])
-
-
-def test_the_preview_shows_where_the_discs_were_found(filmed: Path, tmp_path: Path) -> None:
-    """Crosses at the discs of the last frame, and nowhere in a frame without an answer."""
-    words = ['camera', str(filmed / 'frames'), '--params-file', str(filmed / 'camera.yaml')]
-    for frames, crosses in (('5', True), ('4', False)):
-        out = ['--out', str(tmp_path / f'{frames}.csv'), '--show', str(tmp_path / 'now.png')]
-        assert main([*words, *out, '--frames', frames]) == 0
-        shown = cv2.imread(str(tmp_path / 'now.png'))
-        assert shown is not None
-        green = (shown[..., 1].astype(int) - shown[..., 2]) > 100
-        observed = [pixel_of(Scene(turn=0.1), POSES[-1], 0.0, 0.025 * i) for i in (1, 0, -1)]
-        assert [bool(green[round(v), round(u)]) for u, v in observed] == [crosses] * 3
-
-
-@pytest.mark.parametrize('name', ['reference.mcap', 'reference'])
-def test_a_bag_has_the_poses_with_and_without_covariance(
-    filmed: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / name
-    words = [
-        'camera',
-        str(filmed / 'frames'),
-        '--params-file',
-        str(filmed / 'camera.yaml'),
-        '--out',
-        str(out),
-        '--json',
-    ]
-    assert main(words) == 0
-    output = json.loads(capsys.readouterr().out)
-    assert (output['frames'], output['answers'], output['rejected']) == (5, 4, {'no target': 1})
-    assert output['turn'] == pytest.approx(0.1, abs=1e-3)
-    recording = open_recording(out)
-    references = recording.references()
-    assert [r.t_ns for r in references] == [2_000_000, 35_333_000, 68_667_000, 135_333_000]
-    assert [r.dx for r in references] == pytest.approx([p.dx for p in POSES], abs=10e-6)
 
 
 @pytest.mark.parametrize(

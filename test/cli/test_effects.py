@@ -64,9 +64,3 @@ def test_what_is_corrected_is_reported() -> None:
 def test_a_wrong_name_is_reported_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['effects', 'sensor_rotatoin']) == 2
     assert 'did you mean sensor_rotation' in capsys.readouterr().err
-
-
-def test_an_effect_without_its_size_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ['simulate', '--out', str(tmp_path / 'run'), '--loads', 'thesis', '--effect', 'sensor_rotation,psd=2']
-    assert main(words) == 2
-    assert 'sensor_rotation is off without angle' in capsys.readouterr().err

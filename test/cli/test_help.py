@@ -120,6 +120,7 @@ def examples(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pyte
     return [re.split(r' {2,}', line.strip())[0] for line in lines if line.startswith(f'  {OURS}')]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_its_examples_run(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

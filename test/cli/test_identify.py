@@ -39,30 +39,6 @@ def test_the_modes_of_the_link_not_of_the_file(run: Path, capsys: pytest.Capture
     assert set(found['parameters']) < set(load_rig(None).values)
 
 
-def test_a_person_reads_sentences_and_sees_pictures(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / 'out'
-    rig = tmp_path / 'mine.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    min_samples: 12 # mine\n')
-    assert main(['identify', str(run), '--params-file', str(rig), '--out', str(out)]) == 0
-    output = capsys.readouterr().out
-    assert 'Hz, damping ratio 0.0' in output
-    assert 'from 2 ring-downs' in output
-    assert 'input shaper' in output
-    assert 'dynamics.bending_frequency: 1' in output
-    text = (out / 'rig.yaml').read_text()
-    assert text.startswith('# Identified by psd-deflection ')
-    assert 'min_samples: 12 # mine' in text
-    assert load_rig(out / 'rig.yaml').dynamics.bending_frequency == pytest.approx(11.0, rel=5e-4)
-    page = (out / 'report.html').read_text()
-    assert page.count('<figure class="chart"') == 3
-    # The modes are a table: one row for each, with the axis in its first cell.
-    assert [page.count(f'<tr><td>{axis}</td><td>1') for axis in ('ΔX', 'ΔY')] == [1, 1]
-    assert '<p class=verdict>Modes: 1 along ΔX, 1 along ΔY, 1 along θ.</p>' in page
-    assert json.loads((out / 'identify.json').read_text())['axes']['theta']['modes']
-
-
 def test_a_link_at_rest_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'still.csv'
     assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:2']) == 0

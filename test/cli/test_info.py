@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.cli.recordings.info import _lines_of_parameters
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, ParameterChange, SampleBlock
@@ -123,32 +122,9 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
     assert found['lost'] == 0
 
 
-def test_an_unreadable_recording_is_status_4_and_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['info', str(tmp_path / 'none.csv')]) == 4
-    output = capsys.readouterr().err
-    assert output.count('\n') == 1
-    assert 'no such recording' in output
-
-
 def test_an_older_word_for_a_default_is_no_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = {**load_rig().flat(), 'degraded': 'off'}
     with BagWriter(tmp_path / 'old', rig_values=old) as out:
         out.put(block(0))
     assert main(['info', str(tmp_path / 'old')]) == 0
     assert 'all parameters at their defaults' in capsys.readouterr().out
-
-
-def test_a_memory_of_the_pipeline_is_one_short_line() -> None:
-    found = {
-        'parameters': {},
-        'changed_parameters': {},
-        'as_in_the_thesis': [],
-        'changes': [
-            {'block': 1258, 'values': {'state.noise': (23.0,) * 60, 'state.whole': 1.0}},
-            {'block': 1300, 'values': {'sum_min': 2.0}},
-        ],
-    }
-    assert _lines_of_parameters(found) == [
-        '  from block 1258 on: 2 values of the state',
-        '  from block 1300 on: sum_min = 2.0',
-    ]

@@ -105,6 +105,7 @@ def test_a_value_that_an_option_does_not_take_is_status_2(
     assert [p.name for p in folder.iterdir()] == ['taken']
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('command', 'also'), [('convert', '.rrd'), ('replay', '.rrd .parquet'), ('simulate', '')])
 def test_a_recording_is_not_written_under_the_ending_of_something_else(
     command: str, also: str, folder: Path, capsys: pytest.CaptureFixture[str]
@@ -308,6 +309,7 @@ def test_an_output_that_cannot_be_written_to_is_one_line(command: str, unbuffere
     assert (folder / 'whole.csv').exists() == ('whole.csv' in command)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='no /dev/full here')
 @pytest.mark.parametrize('where', ['2>&-', '2>/dev/full'])
 def test_a_closed_standard_error_keeps_the_exit_status(where: str, folder: Path) -> None:
@@ -435,23 +437,6 @@ def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPa
         main(['info', 'x.csv'])
 
 
-@pytest.mark.parametrize(
-    'words',
-    [
-        ['budget'], ['budget', '--explain'], ['design'], ['design', '--params-file', RIG], ['effects'],
-        ['effects', 'plane_tilt'], ['params'], ['thesis', 'compare-methods'], ['replay', CLEAN], ['info', CLEAN],
-    ],
-    ids=' '.join,
-)  # fmt: skip
-def test_quantities_are_written_alike_and_nothing_is_written_to_disk(
-    words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 0
-    out = capsys.readouterr().out
-    assert not re.search(r'(?<![\w.])(um|dX|dY|theta|phi|omega)(?!\w)', out), out
-    assert list(folder.iterdir()) == []
-
-
 def reported() -> Iterator[tuple[Path, str]]:
     """Every text of the package that is no docstring."""
     for path in sorted((ROOT / 'psd_deflection').rglob('*.py')):
@@ -498,6 +483,7 @@ def test_a_recording_with_a_typing_error_is_found(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err.endswith('/nowhere/at/all: no such recording\n')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', ['replay', 'plot'])
 def test_how_long_a_recording_lasts_is_by_its_stamps(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

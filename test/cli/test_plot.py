@@ -6,7 +6,6 @@ import base64
 import itertools
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,16 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.cli.recordings.plot import Drawn, default_out, draw_recording
+from psd_deflection.cli.recordings.plot import Drawn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
-from psd_deflection.records import FloatArray, ParameterChange
-from psd_deflection.run.monitor.spectrum import Spectrum
+from psd_deflection.records import FloatArray
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('ending', 'magic'), [('.png', b'\x89PNG'), ('.svg', b'<?xml'), ('.html', b'<!doctype html>')])
 def test_a_recording_is_drawn(tmp_path: Path, ending: str, magic: bytes, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / f'picture{ending}'
@@ -117,23 +116,6 @@ def test_a_window_is_drawn(loaded: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert main([*arguments, '--out', str(tmp_path / 'window.png')]) == 0
 
 
-def test_a_zero_that_was_taken_is_marked() -> None:
-    drawn = Drawn(open_recording(BAGS / 'clean'))
-    recording = drawn.recording
-    recording.changes = [
-        ParameterChange(0, 100, (('psd_1.zero', (1e-4, 0.0)),)),
-        ParameterChange(0, 150, (('sum_min', 2.0),)),
-    ]
-    middle = next(b for b in recording.blocks() if b.index == 100)
-    recording.changes[0] = recording.changes[0]._replace(t_ns=int(middle.t_ns[0]))
-    for records in replayed(recording, Pipeline(rig_at_start(recording))):
-        for record in records:
-            drawn.add(record)
-    assert drawn.inputs().zeros == [int(middle.t_ns[0])]
-    figure = draw_recording(drawn, Spectrum(rig_at_start(recording), 1.0), rig_at_start(recording), 'clean')
-    assert 'zero taken' in figure.axes[0].get_legend_handles_labels()[1]
-
-
 def test_losses_and_missing_estimates_are_marked() -> None:
     recording = open_recording(BAGS / 'lost_samples')
     drawn = Drawn(recording)
@@ -192,34 +174,6 @@ def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: 
     assert re.search(r'too few samples +1 block$', capsys.readouterr().out, re.MULTILINE)
     assert main(['replay', str(integer)]) == 0
     assert 'no estimate: 1 block, too few samples' in capsys.readouterr().out
-
-
-def test_json_is_in_si_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['plot', str(BAGS / 'laser_off'), '--out', str(tmp_path / 'a.svg'), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found['blocks'], found['estimates'], found['without_estimate']) == (200, 148, {'laser_lost': 52})
-    assert found['duration_s'] == pytest.approx(4.0)
-    assert found['dx']['sd'] == pytest.approx(0.31e-6, abs=0.01e-6)
-    assert found['dy']['min'] < -2e-3 < found['dy']['max']
-    assert Path(found['out']).exists()
-
-
-def test_the_picture_is_named_like_the_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bag = tmp_path / 'run_0.5N'
-    shutil.copytree(BAGS / 'clean', bag)
-    monkeypatch.chdir(bag)
-    assert main(['plot', '.']) == 0
-    assert 'written to run_0.5N.png' in capsys.readouterr().out
-    assert (bag / 'run_0.5N.png').exists()
-    for recording, name in (
-        ('../run_0.8N', 'run_0.8N.png'),
-        ('../run_0.5N/', 'run_0.5N.png'),
-        ('clean_0.mcap', 'clean_0.png'),
-        ('a/run_0.5N.CSV', 'run_0.5N.png'),
-    ):
-        assert default_out(recording) == Path(name)
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,10 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.model.solvers import SOLVERS
 from psd_deflection.studies.thesis.comparison import CAUSES, methods
 from psd_deflection.studies.thesis.figures import FIGURES
 
 pytestmark = pytest.mark.slow
-
-DOCS = Path(__file__).parents[2] / 'docs'
 
 
 def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,14 +75,3 @@ def test_a_figure_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / 'comparison.png').mkdir()
     assert main(['thesis', 'compare-methods', '--out', str(tmp_path)]) == 4
     assert f'--out {tmp_path / "comparison.png"}: cannot be written' in capsys.readouterr().err
-
-
-def test_the_page_has_every_method_and_every_figure() -> None:
-    page = (DOCS / 'methods.md').read_text()
-    for name in SOLVERS:
-        assert f'`{name}`' in page, name
-    # Those of the methods as printed are in the audit.
-    page += (DOCS / 'audit.md').read_text()
-    for name in FIGURES:
-        assert f'(figures/{name}.png)' in page, name
-        assert (DOCS / 'figures' / f'{name}.png').exists()

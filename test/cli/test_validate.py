@@ -56,24 +56,6 @@ def test_the_offset_is_reported_and_removed_if_asked(run: Path, late: Path, caps
     assert found['solvers']['exact']['dy']['rms'] < 0.01 * without
 
 
-def test_a_person_reads_sentences_and_a_table(
-    run: Path, late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / 'new' / 'out'
-    assert main(['validate', str(run), '--reference', str(late), '--align', '--out', str(out)]) == 0
-    output = capsys.readouterr().out
-    assert 'ahead of that of the samples: subtract 12.' in output
-    assert 'The offset is removed in what follows.' in output
-    assert 'The reference gave no answer 1 times: blurred 1.' in output
-    lines = output.splitlines()
-    assert any(line.startswith('exact ') for line in lines)
-    assert not any(line.startswith('appendix_d ') for line in lines)
-    page = (out / 'report.html').read_text()
-    assert page.count('<figure class="chart"') == 3
-    assert 'ahead of that of the samples' in page
-    assert json.loads((out / 'validate.json').read_text())['solver'] == 'exact'
-
-
 def test_other_solvers_are_compared_if_asked(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def compared(*words: str) -> list[str]:
         assert main(['validate', str(run), '--json', *words]) == 0
@@ -95,19 +77,6 @@ def test_a_solver_that_cannot_solve_the_rig_is_reported_if_it_was_named(run: Pat
     assert 'appendix_d' not in psd_deflection.validate(run, rig=rig, solvers=['all']).agreements
     with pytest.raises(PsdDeflectionError, match='appendix_d divides by both'):
         psd_deflection.validate(run, rig=rig, solvers=['appendix_d'])
-
-
-def test_a_wrong_gain_is_the_scale(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wide = 1.01 * load_rig(None).amplifier.sensitivity
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text(
-        f'/**:\n  ros__parameters:\n    psd_1:\n      sensitivity: [{wide}, {wide}]\n'
-        f'    psd_2:\n      sensitivity: [{wide}, {wide}]\n'
-    )
-    assert main(['validate', str(run), '--params-file', str(rig), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found['solvers']['exact']['dy']['scale'] == pytest.approx(0.01, rel=0.05)
-    assert found['solvers']['exact']['theta']['scale'] == pytest.approx(0.01, rel=0.05)
 
 
 def test_a_recording_without_a_reference_says_how_to_give_one(

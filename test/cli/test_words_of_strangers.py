@@ -39,6 +39,7 @@ def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, caps
     assert '\\x1b[31mred' in out
 
 
+@pytest.mark.slow
 def test_names_of_files_reach_the_terminal_in_printable_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

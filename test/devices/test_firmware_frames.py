@@ -45,6 +45,7 @@ def decoded(frames: ctypes.CDLL, stuffed: bytes) -> bytes | None:
     return buffer.raw[: size.value] if frames.frame_decode(buffer, ctypes.byref(size)) else None
 
 
+@pytest.mark.slow
 @given(
     flags=st.integers(0, 3),
     seq=st.integers(0, 2**32 - 1),

@@ -59,17 +59,6 @@ def test_it_is_listed_made_and_known_to_be_simulated() -> None:
 
 
 @pytest.mark.usefixtures('installed')
-def test_help_names_it(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('COLUMNS', '200')
-    with pytest.raises(SystemExit):
-        main(['devices', '--help'])
-    assert f'{NAME}  six voltages a line' in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main(['simulate', '--help'])
-    assert ', '.join(SIMULATED) in ' '.join(capsys.readouterr().out.split())
-
-
-@pytest.mark.usefixtures('installed')
 def test_a_session_without_a_port_runs_on_its_twin() -> None:
     logged: list[str] = []
     estimates = Estimates(4)

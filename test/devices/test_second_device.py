@@ -15,9 +15,6 @@ import pytest
 
 from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import (
-    BadFrame,
-    Frame,
-    FrameDecoder,
     GoodFrame,
     HelloFrame,
     HelloRequestFrame,
@@ -29,7 +26,6 @@ from psd_deflection.devices.protocol.frames import (
     StopFrame,
     encode,
 )
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.session import Session
@@ -115,33 +111,3 @@ def test_it_works_unchanged_with_the_daemon(port: str) -> None:
     ramp = [round(v * 32768 / 10) for b in blocks for v in b.volts[:, 0].tolist()]
     assert ramp == [(s - (2**32 - 500)) % 2**32 % 2000 for s in numbers]
     assert any(isinstance(r, DeflectionEstimate) for r in kept.records)
-
-
-def test_it_answers_what_the_page_asks_of_it(port: str) -> None:
-    line = SerialPort(port, 921_600)
-    decoder = FrameDecoder()
-    observed: list[Frame] = []
-
-    def until(kind: type[object]) -> Frame:
-        observed.clear()
-        while not any(isinstance(f, kind) for f in observed):
-            observed.extend(decoder.feed(line.read(10.0)))
-        return next(f for f in observed if isinstance(f, kind))
-
-    line.write(b'\x07junk\x00\x00' + encode(PingFrame(COOKIE)))
-    pong = until(PongFrame)
-    assert isinstance(pong, PongFrame)
-    assert pong.cookie == COOKIE
-    line.write(encode(StopFrame()) + encode(PingFrame(1)))
-    until(PongFrame)
-    line.write(encode(PingFrame(2)))
-    until(PongFrame)
-    assert not any(isinstance(f, SampleFrame) for f in observed)
-    line.write(encode(StartFrame()))
-    sample = until(SampleFrame)
-    assert isinstance(sample, SampleFrame)
-    assert not any(isinstance(f, BadFrame) for f in observed)
-    status = until(StatusFrame)
-    assert isinstance(status, StatusFrame)
-    assert status.temperature_centi is None
-    line.close()

@@ -16,6 +16,7 @@ from test.run.conftest import Estimates
 SLOW: dict[str, object] = {'converter.sample_rate_hz': 25.0, 'block_size': 2, 'min_samples': 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('source', 'overrides', 'described'),
     [

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import threading
 from pathlib import Path
@@ -12,21 +11,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import yaml
 
 from psd_deflection.cli.main import main
 from psd_deflection.devices import survey as port_survey
 from psd_deflection.devices.contract_frames import SimulatedFrames
-from psd_deflection.devices.dataq import SimulatedDataq
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.serve import serve
 from psd_deflection.devices.served_sockets import open_sockets
 from psd_deflection.devices.survey import serial_ports, survey
-from psd_deflection.devices.text_lines import SimulatedLines
-from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.rig.config import load_rig
-from psd_deflection.rig.parameter_files import read_parameter_file
 
 pytestmark = pytest.mark.slow
 
@@ -72,48 +66,6 @@ def test_a_host_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]) -
         name = f'socket://127.0.0.1:{free.getsockname()[1]}'
     assert main(['devices', name]) == 5
     assert f'{name}: the host is there, but nothing listens' in capsys.readouterr().err
-
-
-def test_each_is_known_by_its_answer(
-    served: Any,
-    unloaded: Any,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # Each of them answers: however late, it is waited for.
-    monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 60.0)
-    monkeypatch.setattr(port_survey, 'BOOT_S', 60.0)
-    rig = load_rig()
-    shared = SharedRig(unloaded(rig))
-    devices = [
-        SimulatedFrames(unloaded(rig)),
-        SimulatedDataq(unloaded(rig)),
-        SimulatedLines(unloaded(load_rig(overrides={'converter.sample_rate_hz': 200.0}))),
-        SimulatedAligner(shared, 1),
-        SimulatedAligner(shared, 2),
-        SimulatedDataq(unloaded(rig), model='1100'),
-    ]
-    names = [str(served(d).link) for d in devices]
-    assert main(['devices', '--json', *names]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [p['source'] for p in found['ports']] == ['serial', 'dataq', 'lines', 'thorlabs', 'thorlabs', '']
-    assert 'SIM-0001' in found['ports'][0]['answer']
-    assert 'DI-1100: six analog inputs' in found['ports'][5]['answer']
-    one, two, three, pair = found['suggested']
-    assert (one['source'], one['port'], one['converter.full_scale']) == ('serial', names[0], 10.0)
-    assert two['source'] == 'dataq'
-    assert three['converter.sample_rate_hz'] == 200.0
-    assert pair['port'] == f'{names[3]},{names[4]}'
-
-    assert main(['devices', *names[3:5]]) == 0
-    text = capsys.readouterr().out
-    lines = text[text.index('/**:') :]
-    assert yaml.safe_load(lines)['/**']['ros__parameters']['source'] == 'thorlabs'
-    path = tmp_path / 'suggested.yaml'
-    path.write_text(lines)
-    assert load_rig(path).converter.sample_rate_hz == 200.0
-    assert read_parameter_file(path)['port'] == pair['port']
 
 
 def test_a_port_in_use_or_missing_is_named_and_left_alone(

@@ -9,6 +9,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 LAST = {'2.': 49, '3.': 23, '4.': 34, '5.': 7, 'A-': 21, 'B-': 8}
 """The last equation of each chapter and appendix; all before it are numbered."""
@@ -60,6 +62,7 @@ def texts() -> Iterator[tuple[str, str]]:
                 yield str(path.relative_to(ROOT)), ast.get_docstring(node) or ''
 
 
+@pytest.mark.slow
 def test_no_equation_is_quoted_that_the_thesis_has_not() -> None:
     quoted = [(where, n) for where, text in texts() for q in _QUOTED.findall(text) for n in re.findall(_NUMBER, q)]
     assert len(quoted) > 50

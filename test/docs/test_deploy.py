@@ -34,13 +34,6 @@ def test_systemd_understands_the_unit(tmp_path: Path) -> None:
     assert verified(UNIT.read_text(), tmp_path) == (0, '')
 
 
-@pytest.mark.parametrize('wrong', ['WatchdogSec=soon', 'Restart=sometimes', 'LimitRTPRIO=high', 'ProtectSytem=strict'])
-def test_systemd_would_say_what_it_does_not_understand(wrong: str, tmp_path: Path) -> None:
-    text = UNIT.read_text().replace('[Service]\n', f'[Service]\n{wrong}\n')
-    _, complaints = verified(text, tmp_path)
-    assert f'{UNIT.name}:{text.splitlines().index(wrong) + 1}: ' in complaints
-
-
 def test_the_unit_asks_for_what_the_daemon_uses() -> None:
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str  # type: ignore[assignment, method-assign]

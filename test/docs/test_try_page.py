@@ -69,19 +69,6 @@ def test_every_choice_is_tried() -> None:
     assert all(float(least) <= float(usual) <= float(most) for _, usual, least, most, _ in CHOICES)
 
 
-@pytest.mark.parametrize(
-    ('hidden', 'message'),
-    [
-        ('creep,amplitude=0.03', 'load_direction is missing from the model'),
-        ('creep,amplitude=0.03', 'Nothing is missing: the gap is 1 µm'),
-        ('nothing', 'creep is missing from the model'),
-        ('creep,amplitude=0.03', ''),
-    ],
-)
-def test_another_answer_than_what_was_hidden_is_wrong(hidden: str, message: str) -> None:
-    assert try_page.wrong(hidden, message)
-
-
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the registries would give: an interpreter with its lock file, and a package with the wheel of it."""
@@ -132,28 +119,9 @@ def test_a_wheel_that_the_lock_file_does_not_name_is_rejected(cache: Path, tmp_p
     assert not (tmp_path / 'site').exists()
 
 
-def test_a_wheel_that_is_not_carried_is_rejected(cache: Path, tmp_path: Path) -> None:
-    carry(cache, {'numpy': b'a wheel', 'scipy': b'a wheel'})
-    with pytest.raises(pyodide_site.WrongFileError, match=r'has no blas\.whl'):
-        pyodide_site.fill(tmp_path / 'site', cache)
-
-
 def test_another_interpreter_is_rejected_and_not_kept(cache: Path, tmp_path: Path) -> None:
     packed = cache / f'pyodide-{pyodide_site.VERSION}.tgz'
     packed.write_bytes(packed.read_bytes() + b'\0')
     with pytest.raises(pyodide_site.WrongFileError, match='its hash is sha512-'):
         pyodide_site.fill(tmp_path / 'site', cache)
     assert not packed.exists()
-
-
-def test_a_site_without_the_registries_is_built_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(pyodide_site, 'CACHE', tmp_path / 'cache')
-    monkeypatch.setenv('PATH', '')
-    monkeypatch.setattr(sys, 'argv', ['pyodide_site', str(tmp_path / 'site')])
-    left = tmp_path / 'site' / pyodide_site.FOLDER
-    left.mkdir(parents=True)
-    assert pyodide_site.main() == 0
-    assert capsys.readouterr().err.startswith('try.html of this site cannot run: npm is not installed.')
-    assert not left.exists()

@@ -43,6 +43,7 @@ def bits(value: object) -> object:
     return value.tobytes() if isinstance(value, np.ndarray) else value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['clean', 'lost_samples', 'laser_off', 'motion', 'calibrated', 'three_psds'])
 def test_a_golden_recording_in_chunks_of_any_size_has_the_same_bits(name: str) -> None:
     recording = open_recording(BAGS / name)

@@ -102,18 +102,6 @@ def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: t
     np.testing.assert_allclose(wrench, load, atol=5e-3)
 
 
-@pytest.mark.slow
-def test_iterative_agrees_with_exact_and_wls_shows_its_small_angle_error(rig: Rig) -> None:
-    pose = (0.002, -0.002, np.deg2rad(1.0))
-    records = run(Pipeline(rig).process, chunk_of(still(pose, 20 * 500, 3)))
-    exact, iterative, wls = (estimates(records, name) for name in ('exact', 'iterative', 'wls'))
-    assert abs(exact - iterative).max() < 1e-9
-    # Small angles (docs/methods.md): theta_hat = sin theta, d_hat = R(-theta) d + (1 - cos theta) mean(l).
-    error = (wls - pose).mean(axis=0)
-    np.testing.assert_allclose(error[:2], [-42.825e-6, -29.270e-6], atol=0.1e-6)
-    assert np.rad2deg(error[2]) * 1e3 == pytest.approx(-0.05077, abs=0.05)
-
-
 def spots_of(records: list[Record]) -> SpotMeans:
     (spots,) = (r for r in records if isinstance(r, SpotMeans))
     return spots
@@ -191,6 +179,7 @@ def test_a_zero_forgets_what_was_before_an_unplugging(rig: Rig) -> None:
     assert abs(estimates(after, 'exact').mean(axis=0)).max() < 2e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'effect',
     [
@@ -467,6 +456,7 @@ def test_with_decimation_each_block_has_its_estimate_and_one_of_so_many_the_rest
     assert poses[every] == poses[1]
 
 
+@pytest.mark.slow
 def test_a_recording_with_decimation_is_replayed_bit_for_bit_with_as_many_messages(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from blind.watch import SIZES, WITHIN_S, quiet, table, watch_run
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Watch, _Channel, _Window
 from psd_deflection.model.solvers.registry import solver_from_rig
@@ -103,6 +102,7 @@ def wandering(t: FloatArray, rms: float = 1e-6, tau: float = 20.0) -> FloatArray
     return np.asarray(REST + out)
 
 
+@pytest.mark.slow
 def test_beams_that_wander_are_an_alarm_unless_the_rig_says_so() -> None:
     """Review: 1 um rms with 20 s between one place and another."""
     allowed = {'watch_wander': 4e-6}
@@ -171,16 +171,6 @@ def test_the_base_line_may_be_wrong_by_two_thousandths_of_a_movement() -> None:
         assert alarmed(fed) is alarm
 
 
-def test_three_seconds_pass_from_what_is_sure_to_the_alarm() -> None:
-    """A large shift is sure after two windows of half a second."""
-    fed = Fed()
-    fed.load(0.0, 0.0)
-    fed.run(10.0, REST)
-    fed.run(6.0, REST + 10.0 * X1)
-    assert fed.watch.alarm is not None
-    assert fed.watch.alarm.observed_ns / 1e9 == pytest.approx(14.0, abs=0.3)
-
-
 def test_the_readings_under_a_load_are_learnt_in_two_seconds() -> None:
     fed = Fed()
     assert fed.watch.state == 'no window yet'
@@ -203,6 +193,7 @@ def test_readings_without_noise_are_watched_too() -> None:
     assert fed.watch.alarm.channel == 'x1'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('a', 'b'), [(1, 2), (1, 3), (2, 3)])
 def test_each_base_line_of_three_psds_is_watched(a: int, b: int) -> None:
     """Both dots go apart along the line between their PSDs, soon after the begin."""
@@ -318,25 +309,6 @@ def test_drift_ringing_and_gaps_are_no_alarm() -> None:
     fed.run(10.0, REST + 1e-6)
     assert fed.watch.alarms == 0
     assert fed.watch.spoilt > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('kind', SIZES)
-def test_events_of_the_second_generator_are_observed(kind: str) -> None:
-    run = watch_run((kind, 1000))
-    assert run.after < WITHIN_S
-    assert not run.early
-    text, met = table([run], 0.0, 0, (), 0.0)
-    assert met
-    assert 'in 1 of 1' in text
-
-
-def test_quiet_minutes_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('blind.watch.HOLDS', 3)
-    hours, alarms, message, _ = quiet((0.05, 1))
-    assert hours >= 0.05
-    assert (alarms, message) == (0, [])
-    assert not table([], hours, 1, ['x1'], 0.0)[1]
 
 
 def learnt(*means: float) -> _Channel:

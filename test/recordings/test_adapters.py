@@ -8,7 +8,6 @@ import json
 import math
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,15 +18,11 @@ from rosbags.typesys import Stores, get_typestore
 from msg_adapters import (
     DEFLECTION,
     DEFLECTION_WITH_COVARIANCE,
-    INPUTS,
     MESSAGE_TYPES,
     RIG,
-    ROWS,
     SAMPLES,
     SPOTS,
     TOPIC_TYPES,
-    TOPICS,
-    Topic,
     from_fields,
     point_cloud2,
     pose_stamped,
@@ -55,9 +50,7 @@ from psd_deflection.records import (
     EndEffectorDeflection,
     FloatArray,
     Mark,
-    Record,
     ReferencePose,
-    ReferenceWithCovariance,
     RigState,
     SampleBlock,
     TemperatureReading,
@@ -66,7 +59,7 @@ from psd_deflection.records import (
     channel_names,
 )
 
-from .making import STEP, T0, block, estimate, motion, run, spots
+from .making import STEP, T0, block, estimate, run, spots
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -147,56 +140,6 @@ def test_the_parts_of_a_definition_stand_below_80_signs_each() -> None:
     kind = MessageType('a/msg/B', '', 'a/C c\n', {'a/C': 'int8 d\nint8 E=1\n'})
     assert kind.definition == f'a/C c\n{"=" * 80}\nMSG: a/C\nint8 d\nint8 E=1\n'
     assert (kind.members(), kind.members('a/C'), kind.members('int8')) == ([('a/C', 'c')], [('int8', 'd')], [])
-
-
-def test_what_is_latched_and_what_is_listened_to() -> None:
-    assert [t.name for t in TOPICS if t.delivery.latched] == ['/link_tip/rig']
-    assert INPUTS == (
-        '/link_tip/load',
-        '/link_tip/mark',
-        '/link_base/acceleration',
-        '/reference/deflection',
-        '/reference/deflection_with_covariance',
-        '/environment/temperature',
-    )
-
-
-def test_each_topic_has_the_fields_of_its_own_dot() -> None:
-    published = {m.topic: m.fields for m in to_messages(spots(3))}
-    assert {t.name: t.fields(spots(3)) for t in TOPICS if t.name in SPOTS} == published
-
-
-OF_EACH_KIND: list[Record] = [
-    block(3),
-    replace(spots(3), dots=(1e-3,) * 2 * MOST_PSDS, sums=(5.0,) * MOST_PSDS),
-    estimate(3),
-    motion(3),
-    TipLoad(T0, 1.0, 2.0, 3.0),
-    AppliedLoad(T0, 1.0, 2.0, 3.0),
-    Mark(T0, 'bumped it here'),
-    BaseAcceleration(T0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
-    ReferencePose(T0, 1e-3, 2e-3, 3e-3),
-    ReferenceWithCovariance(T0, 1e-3, 2e-3, 3e-3, 0.0, 0.0, (1e-12,) * 9),
-    TemperatureReading(T0, 21.5),
-    DiagnosticReport(T0, ()),
-    RigState(T0, 0, {}, None, {}, '1'),
-]
-
-
-@pytest.mark.parametrize('row', TOPICS, ids=lambda row: row.name)
-def test_every_message_is_made_by_its_row(row: Topic, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No message is made beside the table: with another function in a row its messages are others."""
-    (record,) = (one for one in OF_EACH_KIND if type(one) is row.record)
-    made = [m.topic for m in to_messages(record) if m.topic in (row.name, row.name.format(solver='exact'))]
-    assert made
-
-    def broken(item: object) -> dict[str, Any]:
-        raise ZeroDivisionError(row.name)
-
-    rows = tuple(one._replace(fields=broken) if one is row else one for one in ROWS[row.record])
-    monkeypatch.setitem(ROWS, row.record, rows)
-    with pytest.raises(ZeroDivisionError, match=row.name.replace('{', '.').replace('}', '.')):
-        to_messages(record)
 
 
 def test_each_raw_sample_as_plain_numbers() -> None:
@@ -318,17 +261,6 @@ def test_seq_is_recorded_modulo_2_to_the_32_with_what_is_above_beside_it() -> No
     assert points['seq_high'].tolist() == [0] * 16 + [1]
     (before,) = to_messages(block(start - 1, first_index=start - 1))
     assert before.fields['point_step'] == 32
-
-
-def test_a_block_with_a_long_pause_takes_two_messages() -> None:
-    full = block(0)
-    t_ns = full.t_ns.copy()
-    t_ns[12:] += 10 * 10**9
-    paused = SampleBlock(0, full.seq, t_ns, full.volts, full.flags)
-    first, second = to_messages(paused)
-    assert (first.fields['width'], second.fields['width']) == (12, 8)
-    t, points = point_cloud2.to_points(second.fields)
-    np.testing.assert_array_equal(t + points['dt'].astype(np.int64), t_ns[12:])
 
 
 @pytest.mark.parametrize(('span', 'pieces'), [(2**32 - 1, 1), (2**32, 2)])

@@ -91,19 +91,6 @@ def test_recorded_estimates_come_back(bag: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_samples_are_one_array(bag: Path) -> None:
-    recording = psd_deflection.open(bag)
-    blocks = list(recording.blocks())
-    samples = recording.samples
-    np.testing.assert_array_equal(samples['seq'], np.concatenate([b.seq for b in blocks]))
-    np.testing.assert_array_equal(samples['t_ns'], np.concatenate([b.t_ns for b in blocks]))
-    np.testing.assert_allclose(samples['t'], (samples['t_ns'] - T0) * 1e-9)
-    for i, c in enumerate(CHANNELS):
-        np.testing.assert_array_equal(samples[c], np.concatenate([b.volts[:, i] for b in blocks]))
-    assert (samples['flags'] != 0).sum() == sum((b.flags != 0).sum() for b in blocks) > 0
-
-
-@pytest.mark.slow
 def test_a_lone_file_and_a_folder_without_metadata_are_read(bag: Path, tmp_path: Path) -> None:
     expected = list(open_recording(bag).blocks())
     assert_same(list(open_recording(bag / 'run_0.mcap').blocks()), expected)
@@ -265,14 +252,6 @@ def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
         list(open_recording(write_mcap(tmp_path / 'a.mcap', [block(0), paused, later])).blocks()),
         [block(0), paused, later],
     )
-
-
-@pytest.mark.slow
-def test_another_block_size_gives_the_same_samples(bag: Path) -> None:
-    blocks = list(open_recording(bag, block_size=50).blocks())
-    assert [b.index for b in blocks] == list(range(60))
-    assert all(int(b.seq[0]) // 50 == int(b.seq[-1]) // 50 == b.index for b in blocks)
-    assert sum(len(b.seq) for b in blocks) == len(open_recording(bag).samples)
 
 
 @pytest.mark.slow

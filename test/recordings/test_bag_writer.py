@@ -19,12 +19,11 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
-from msg_adapters import RIG, TOPIC_TYPES, spot_topics, string, to_messages
-from psd_deflection import __version__
+from msg_adapters import RIG, TOPIC_TYPES, spot_topics, to_messages
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.write.bag_writer import META_SOFTWARE, BagWriter, McapFile
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import MOST_PSDS
 from psd_deflection.rig.config import load_rig
 
@@ -153,15 +152,6 @@ def test_a_late_message_does_not_stretch_a_chunk(tmp_path: Path) -> None:
             if isinstance(r, Chunk)
         ]
     assert spans == [0, 0, 0]
-
-
-def test_parameters_version_and_hello_are_inside(tmp_path: Path) -> None:
-    folder = record(tmp_path / 'run', 1)
-    assert metadata_of(folder / 'run_0.mcap')[META_SOFTWARE]['version'] == __version__
-    with (folder / 'run_0.mcap').open('rb') as f:
-        ((_, _, message),) = make_reader(f).iter_messages([RIG])
-    state = string.to_rig(cdr.decode('std_msgs/msg/String', message.data))
-    assert (state.parameters, state.hello, state.version) == (dict(load_rig().values), HELLO, __version__)
 
 
 def test_an_empty_bag_opens(tmp_path: Path) -> None:

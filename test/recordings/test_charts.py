@@ -53,6 +53,7 @@ def _spans(x: np.ndarray, y: np.ndarray) -> list[tuple[float, float]]:
     return [(float(x[a]), float(x[b - 1])) for a, b in ends.reshape(-1, 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('drawing', ['samples', 'estimates'])
 @pytest.mark.parametrize('bag', ['lost_samples', 'laser_off'])
 def test_a_figure_draws_no_line_over_a_gap(drawing: str, bag: str) -> None:

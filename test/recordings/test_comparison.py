@@ -77,6 +77,7 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     monkeypatch.setattr(ExactSolver, 'solve', lambda *a: (s := solve(*a))._replace(dx=s.dx * (1.0 + share)))
 
 
+@pytest.mark.slow
 def test_rounding_of_another_version_is_reported_and_is_no_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

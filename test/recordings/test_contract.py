@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -106,16 +105,10 @@ def test_the_messages(folder: Path) -> None:
         assert np.linalg.eigvalsh(k[np.ix_([0, 1, 5], [0, 1, 5])]).min() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('folder', BAGS, ids=lambda p: p.name)
 def test_we_read_what_they_read(folder: Path) -> None:
     theirs = [points(m) for m in decoded(folder)['/psd/samples']]
     ours = open_recording(folder).samples
     for name in ['seq', *FIELDS[2:]]:
         np.testing.assert_array_equal(ours[name], np.concatenate([p[name] for p in theirs]))
-
-
-def test_the_lines_in_the_docs_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    code, *_ = re.findall(r'```python\n(.*?)```', (ROOT / 'docs' / 'recording.md').read_text(), re.DOTALL)
-    monkeypatch.chdir(ROOT)
-    exec(code, {})  # noqa: S102
-    assert capsys.readouterr().out.startswith('[0.')

@@ -64,6 +64,7 @@ def test_gaps_in_time_are_lost_samples(tmp_path: Path) -> None:
     assert [b.index for b in recording.blocks()] == [0, 1, 2, 4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('rate', [50.0, 1000.0, 3000.0, 9999.0])
 @pytest.mark.parametrize('decimals', [4, 6, 9])
 def test_short_decimals_and_a_fast_clock_make_no_losses(tmp_path: Path, rate: float, decimals: int) -> None:
@@ -102,6 +103,7 @@ def test_times_are_read_to_the_nanosecond(tmp_path: Path, t_ns: int, form: str) 
     assert recording.samples['t_ns'].tolist() == [t_ns, t_ns + 1]
 
 
+@pytest.mark.slow
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=6, max_size=6))
 def test_volts_come_through_bit_for_bit(tmp_path: Path, volts: list[float]) -> None:

@@ -136,22 +136,6 @@ def test_a_part_without_samples_is_rejected(
         psd_deflection.open(BAGS / 'clean').crop(*bounds)
 
 
-def test_a_part_is_written_and_studied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    full, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
-    loads = [(0, 0, 0), (8, 0, 0), (0, 0, 0), (0, -8, 0), (0, 0, 0), (0, 0, 2), (0, 0, 0)]
-    made = psd_deflection.simulate(None, loads, seconds=2, seed=2)
-    convert(made, full, made.parameters, Beside.of(made), made.blocks())
-    assert main(['convert', str(full), '--out', str(part), '--from', '0.5', '--to', '8']) == 0
-    assert '7500 samples' in capsys.readouterr().out
-    np.testing.assert_array_equal(psd_deflection.open(part).samples['x1'],
-                                  psd_deflection.open(full).crop(0.5, 8.0).samples['x1'])  # fmt: skip
-    assert main(['info', str(full), '--from', '0.5', '--to', '8', '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['samples'] == 7500
-    # Without its last push the recording does not tell the wires of the twist.
-    assert main(['check', str(full), '--to', '8', '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['verdict'] != 'right'
-
-
 @pytest.mark.parametrize(
     ('words', 'status', 'reported'),
     [

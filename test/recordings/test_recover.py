@@ -102,6 +102,7 @@ def test_recover_rewrites_missing_metadata_identically(full: Path, tmp_path: Pat
     assert yaml.safe_load((folder / 'metadata.yaml').read_text()) == expected
 
 
+@pytest.mark.slow
 def test_the_last_of_several_files_is_repaired(tmp_path: Path) -> None:
     folder = record(tmp_path / 'run', max_s=1.0)
     names = sorted(p.name for p in folder.glob('*.mcap'))
@@ -132,6 +133,7 @@ def test_a_lone_file_is_repaired(tmp_path: Path) -> None:
     assert open_recording(tmp_path / 'a.mcap').complete
 
 
+@pytest.mark.slow
 def test_only_a_damaged_chunk_is_lost_and_it_is_reported(tmp_path: Path) -> None:
     folder = record(tmp_path / 'run')
     content = bytearray((folder / 'run_0.mcap').read_bytes())

@@ -76,13 +76,6 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert 'cannot be made' in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures('no_rerun')
-def test_help_names_the_ending(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(['convert', '--help'])
-    assert 'X.rrd' in capsys.readouterr().out
-
-
 def test_a_disk_that_rejects_is_one_line(
     stand_in: MagicMock, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,6 +84,7 @@ def test_a_disk_that_rejects_is_one_line(
     assert 'a.rrd: cannot be written (File-writer thread shut down)' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('stand_in')
 @pytest.mark.parametrize('name', ['clean', 'lost_samples', 'laser_off'])
 def test_every_estimate_and_no_other_is_written(name: str, tmp_path: Path) -> None:

@@ -97,6 +97,7 @@ def rigs(bag: Path) -> tuple[Rig, Rig]:
     return rig_at_start(recording), rig_at_end(recording)
 
 
+@pytest.mark.slow
 def test_rig_zero_and_hello_are_messages_too(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = passed_on(run, tmp_path / 'converted')
     before, after = open_recording(run), open_recording(bag)
@@ -107,19 +108,6 @@ def test_rig_zero_and_hello_are_messages_too(run: Path, tmp_path: Path, capsys: 
     answer = capsys.readouterr()
     assert 'no bit differs' in answer.out
     assert 'nominal' not in answer.err
-
-
-def test_every_file_of_a_bag_reports_the_rig(run: Path, tmp_path: Path) -> None:
-    recording = open_recording(run)
-    folder = tmp_path / 'split'
-    with BagWriter(folder, rig_values=dict(recording.parameters), device_hello=recording.hello, max_s=1.0) as bag:
-        bag.put(recording.changes[0])
-        for channel, log_time, message in recording.messages([SAMPLES]):
-            bag.write_encoded(channel.topic, channel.type, message, log_time)
-    files = sorted(folder.glob('*.mcap'))
-    assert len(files) > 2
-    assert [open_recording(f).topics()[RIG] for f in files] == [2] * len(files)
-    assert rigs(passed_on(folder, tmp_path / 'converted')) == rigs(run)
 
 
 def test_a_late_subscriber_of_a_played_bag_gets_the_rig(run: Path) -> None:
@@ -142,6 +130,7 @@ def test_another_rig_in_the_same_bag_is_reported(tmp_path: Path) -> None:
     assert any('another rig starts' in w for w in recording.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'command',
     [['replay'], ['replay', '--compare'], ['plot', '--out', 'p.png'], ['convert', '--out', 'c.mcap'], ['discover']],

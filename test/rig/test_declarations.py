@@ -37,17 +37,6 @@ def test_a_field_is_all_that_a_parameter_costs() -> None:
     assert section.of({**values, 'link.payload.mass': 2.0, 'other': 1}) == HeavyLinkConfig(mass=2.0, points=(0.25,))
 
 
-def test_units_and_what_may_be_set_while_samples_flow() -> None:
-    units = {'psd_1.zero': 'm', 'sum_min': 'V', 'link.length': 'm', 'amplifier.noise': 'V', 'monitor_port': ''}
-    assert {name: BY_NAME[name].unit for name in units} == units
-    live = {
-        name: BY_NAME[name].live for name in ('psd_1.zero', 'psd_2.zero', 'sum_min', 'degraded', 'link.length', 'port')
-    }
-    assert live == dict.fromkeys(('psd_1.zero', 'psd_2.zero', 'sum_min', 'degraded'), True) | dict.fromkeys(
-        ('link.length', 'port'), False
-    )
-
-
 def another(p: Parameter) -> Value:
     """A legal value beside the default."""
     if p.choices is not None and p.kind == 'string_array':

@@ -27,7 +27,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Bool, Float64, String  # noqa: E402
@@ -36,7 +36,6 @@ from std_srvs.srv import SetBool  # noqa: E402
 from bench.campaign.graph import BREAKS, URDF  # noqa: E402
 from bench.campaign.hold import WITHIN  # noqa: E402
 from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful  # noqa: E402
-from psd_deflection.arms.compensation.settings import SETTINGS  # noqa: E402
 from test.ros.conftest import WARNINGS  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
@@ -266,41 +265,6 @@ def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program,
     assert plant.step() <= WITHIN
 
 
-def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
-    peer.until(lambda: 'once it is enabled' in compensator.text, 'the node')
-    names = peer.call(ListParameters, '/compensator/list_parameters', ListParameters.Request()).result.names
-    assert {p.name for p in SETTINGS.parameters.values()} <= set(names)
-    asked = GetParameters.Request(names=['joints', 'stale', 'axes'])
-    joints, stale, axes = peer.call(GetParameters, '/compensator/get_parameters', asked).values
-    assert (list(joints.string_array_value), stale.double_value) == (['shoulder', 'elbow'], float(STALE))
-    assert list(axes.string_array_value) == ['x', 'z']
-    described = DescribeParameters.Request(names=['max_rate'])
-    (rate,) = peer.call(DescribeParameters, '/compensator/describe_parameters', described).descriptors
-    assert 'largest rate' in rate.description
-    assert rate.floating_point_range[0].to_value == 10.0
-
-    assert changed(peer, 'max_rate', 0.05).successful
-    rejected = changed(peer, 'max_rate', 20.0)
-    assert not rejected.successful
-    assert not changed(peer, 'max_rat', 0.05).successful
-
-
-@pytest.mark.parametrize(
-    ('words', 'reported'),
-    [
-        (['-p', 'max_ofset:=0.01'], 'max_ofset = 0.01: no parameter of that name; did you mean max_offset'),
-        (['-p', 'max_offset:=-1.0'], 'max_offset = -1.0 rad or m: must be above 0'),
-        (['-p', 'stale:=soon'], "stale = 'soon' s: must be a number"),
-        (['-p', 'joints:=[a,b]'], 'must be those of the arm, in any order: shoulder, elbow'),
-    ],
-)
-def test_a_parameter_that_cannot_be_is_rejected(domain: int, words: list[str], reported: str) -> None:
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--ros-args', *words]
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
-    assert ended.returncode == 3
-    assert reported in ended.stderr
-
-
 @pytest.mark.slow
 def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> None:
     """By what its driver said before the node came, by its speed, and by a controller that ends."""
@@ -384,6 +348,7 @@ sys.exit(main())
 """Our program, whose gate has no memory on the way out."""
 
 
+@pytest.mark.slow
 def test_a_gate_that_fails_on_the_way_out_leaves_no_offset(domain: int, peer: Any) -> None:
     plant = Plant(peer.node)
     node = Program([sys.executable, '-c', OUT_OF_MEMORY, *ARGUMENTS, '--stale', STALE])

@@ -445,6 +445,7 @@ def test_unknown_parameter_ends_the_start(name: str, domain: int, tmp_path: Path
     assert 'max_ofset' in ended.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', nodes_of_setup())
 def test_value_out_of_bounds_ends_the_start(name: str, domain: int, tmp_path: Path) -> None:
     parameter, value = PROFILES[name].beyond

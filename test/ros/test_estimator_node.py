@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import array
-import itertools
 import json
 import math
 import os
@@ -38,11 +37,10 @@ from geometry_msgs.msg import (  # noqa: E402
     WrenchStamped,
 )
 from rcl_interfaces.msg import Log  # noqa: E402
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters  # noqa: E402
+from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
@@ -204,42 +202,6 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     assert len(set(found) & set(received)) >= 50
 
 
-def test_the_rig_is_latched_and_reported_again_when_it_changes(
-    start: Callable[..., Any], peer: Any, simulated_port: str
-) -> None:
-    start('--port', simulated_port, '--ros-args', '-p', 'link.length:=0.6', '-p', 'keep_zero:=false')
-    poses = peer.collect(PoseStamped, '/link_tip/deflection')
-    peer.until(lambda: len(poses) >= 30, 'estimates')
-    # A late subscriber gets what was sent at the start.
-    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    heard = peer.collect(String, '/link_tip/rig', latched)
-    peer.until(lambda: len(heard) >= 1, 'the rig')
-    first = json.loads(heard.pop(0).data)
-    assert first['parameters']['link.length'] == 0.6
-    assert len(first['parameters']) >= 65
-    assert first['hello']['serial'] == 'SIM-0001'
-    assert first['zero'] == {'psd_1': [0.0, 0.0], 'psd_2': [0.0, 0.0]}
-    peer.zero()
-
-    def changes() -> list[Any]:
-        """Those that do not say what the pipeline remembers, which come now and then."""
-        return [text for text in (json.loads(message.data) for message in heard) if 'memory' not in text]
-
-    peer.until(lambda: len(changes()) >= 1, 'the zero')
-    zeroed = changes()[0]
-    assert zeroed['zero'] != first['zero']
-    assert zeroed['zero'] == {psd: zeroed['changed'][f'{psd}.zero'] for psd in ('psd_1', 'psd_2')}
-    assert zeroed['block'] > first['block']
-    value = Parameter('sum_min', value=1.5).to_parameter_msg()
-    peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[value]))
-    peer.until(lambda: len(changes()) >= 2, 'the change')
-    assert changes()[1]['parameters']['sum_min'] == 1.5
-    # Once a change, not once a second.
-    health = peer.collect(DiagnosticArray, '/diagnostics')
-    peer.until(lambda: len(health) >= 3, 'diagnostics')
-    assert len(changes()) == 2
-
-
 @pytest.mark.slow
 def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str
@@ -278,84 +240,6 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     assert [f.name for f in (tmp_path / 'bags').iterdir()] == [folder.name]
 
 
-def test_parameters_have_units_and_ranges_and_are_rejected_by_name(start: Callable[..., Any], peer: Any) -> None:
-    # YAML takes the word for a boolean.
-    start('--ros-args', '-p', 'degraded:=off')
-    poses = peer.collect(PoseStamped, '/link_tip/deflection')
-    peer.until(lambda: len(poses) > 0, 'estimates')
-    request = DescribeParameters.Request(names=['link.length', 'block_size', 'sum_min', 'psd_1.center'])
-    length, block, sum_min, center = peer.call(
-        DescribeParameters, '/estimator/describe_parameters', request
-    ).descriptors
-    assert '[m]' in length.description
-    assert length.floating_point_range[0].to_value == 1000.0
-    assert 'read when the node is configured' in length.additional_constraints
-    assert block.integer_range[0].from_value == 1
-    assert 'read when' not in sum_min.additional_constraints
-    assert center.type == Parameter.Type.DOUBLE_ARRAY.value
-
-    def put(name: str, value: object) -> Any:
-        parameter = Parameter(name, value=value).to_parameter_msg()
-        answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[parameter]))
-        return answer.results[0]
-
-    assert not put('sum_min', -1.0).successful
-    # What cannot be taken while samples flow says what to do; a value that is there already is no change.
-    assert put('link.length', 2.0).reason == (
-        'link.length: is read when the node is configured; first ros2 lifecycle set /estimator deactivate, then cleanup'
-    )
-    assert put('link.length', 0.585).successful
-    assert put('simulated', False).reason == 'simulated: is set by the node'
-    for unknown, advice in (('block_sice', '; did you mean block_size?'), ('', '')):
-        answer = put(unknown, 3)
-        assert not answer.successful
-        assert answer.reason == f'{unknown!r}: no parameter of that name{advice}'
-    # The same words as for a file, with what must fit together as well; then nothing has changed.
-    for word in (False, 'off', 'none'):
-        assert put('degraded', 'hold').successful
-        assert put('degraded', word).successful, word
-        request = GetParameters.Request(names=['degraded'])
-        assert peer.call(GetParameters, '/estimator/get_parameters', request).values[0].string_value == 'none'
-    assert "degraded = 'sideways': must be one of none, hold, zero" in put('degraded', 'sideways').reason
-    assert 'psd_1.zero = [9.0, 0.0] m: must be at least -0.5 and at most 0.5' in put('psd_1.zero', [9.0, 0.0]).reason
-    assert 'sum_min = 9.0 V: must be less than sum_max = 7.5 V' in put('sum_min', 9.0).reason
-    # A level above what the lasers give: they count as lost, and the estimates stop.
-    assert put('sum_min', 6.0).successful
-    health = peer.collect(DiagnosticArray, '/diagnostics')
-
-    def lost() -> bool:
-        return any('laser 1 lost' in s.message for m in health for s in m.status if 'estimates' in s.name)
-
-    peer.until(lost, 'the lost laser in /diagnostics')
-    assert put('sum_min', 2.5).successful
-    peer.until_of_now(poses, 'estimates again')
-    each_parameter_describes_itself(peer)
-
-
-def each_parameter_describes_itself(peer: Any) -> None:
-    names = [p.name for p in PARAMETERS]
-    request = DescribeParameters.Request(names=names)
-    reported = peer.call(DescribeParameters, '/estimator/describe_parameters', request).descriptors
-    assert [d.name for d in reported] == names
-    for declared, d in zip(PARAMETERS, reported, strict=True):
-        assert not d.read_only, d.name
-        assert d.description, d.name
-        ranged = d.floating_point_range or d.integer_range
-        assert bool(ranged) == (declared.kind in ('double', 'integer')), d.name
-        if declared.choices is not None:
-            assert ', '.join(declared.choices) in d.additional_constraints, d.name
-        if declared.kind == 'double_array':
-            assert 'at most' in d.additional_constraints, d.name
-    constraints = {d.name: d.additional_constraints for d in reported}
-    for word, name in itertools.product(('exact', 'wls', 'base_pair'), ('solver', 'solvers')):
-        assert word in constraints[name]
-    # A live run does not take the methods as printed as its answer.
-    assert 'appendix_d' in constraints['solvers']
-    assert 'appendix_d' not in constraints['solver']
-    assert 'dataq' in constraints['source']
-    assert constraints['autostart'] == 'read at the start of the process'
-
-
 @pytest.mark.slow
 def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any], peer: Any, tmp_path: Path) -> None:
     first = start('--ros-args', '-p', 'sum_min:=2.4', '-p', "psd_1.axes:=[-y, 'x']")
@@ -391,6 +275,7 @@ def test_the_log_file_of_the_process_has_the_lines(start: Callable[..., Any], tm
     assert re.fullmatch(r'\[WARN\] \[\d+\.\d{9}\] \[estimator\]: no port given: started the simulated rig .*', line)
 
 
+@pytest.mark.slow
 def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., Any], peer: Any, tmp_path: Path) -> None:
     words = ('publish_volts:=true', 'frame_prefix:=left_', 'markers:=true')
     daemon = start('--record', str(tmp_path), '--ros-args', *(w for word in words for w in ('-p', word)))
@@ -420,6 +305,7 @@ def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., An
     assert main(['replay', str(folder), '--compare', '--strict']) == 0
 
 
+@pytest.mark.slow
 def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start: Callable[..., Any], peer: Any) -> None:
     pytest.importorskip('aiohttp')
     options = {'use_sim_time': True, 'markers': True, 'monitor': True, 'monitor_port': 0, 'monitor_control': True}

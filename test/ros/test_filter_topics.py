@@ -83,16 +83,3 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     assert recording.topics()['/link_tip/velocity'] == recording.topics()['/link_tip/filtered/deflection'] > 60
     assert main(['replay', str(folder), '--compare']) == 0
     assert 'no bit differs' in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_without_the_filter_there_is_no_topic_of_it(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
-    start('--port', simulated_port)
-    health = peer.collect(DiagnosticArray, '/diagnostics')
-    peer.until(lambda: len(health) >= 1, 'diagnostics')
-    graph = dict(peer.node.get_topic_names_and_types())
-    assert '/link_tip/velocity' not in graph
-    assert '/link_tip/filtered/deflection' not in graph
-    assert 'estimator: motion' not in {s.name for s in health[0].status}
-    assert peer.node.count_subscribers('/link_tip/load') == 1
-    assert peer.node.count_subscribers('/link_base/acceleration') == 0

@@ -112,6 +112,7 @@ def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:
     assert 'good' in gated.heard
 
 
+@pytest.mark.slow
 def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> None:
     gated.listen()
     publisher = sender(peer)

@@ -133,6 +133,7 @@ def value_of(peer: Any, name: str) -> Any:
     return parameter_value_to_python(value)
 
 
+@pytest.mark.slow
 def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
 ) -> None:
@@ -252,6 +253,7 @@ def test_the_zero_holds_for_the_next_run(
     assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == [[0.0, 0.0], [0.0, 0.0]]
 
 
+@pytest.mark.slow
 def test_a_shutdown_ends_the_daemon(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
     daemon = start('--port', simulated_port)
     daemon.until('publishing on ROS domain')

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -219,6 +218,7 @@ def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Callable[...,
     assert arm.shaper.text.count('follow_joint_trajectory: rejected: point 0 is not finite') == 1
 
 
+@pytest.mark.slow
 def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) -> None:
     arm = begin()
 
@@ -364,14 +364,7 @@ def test_a_stopped_shaper_stops_the_arm(begin: Callable[..., Arm]) -> None:
     arm.peer.until(lambda: arm.controller is not None and arm.controller.controller.ends < 1e10, 'the hold')
 
 
-NO_ACTION = """
-import sys
-sys.modules['control_msgs'] = None
-from psd_deflection.cli.main import main
-sys.exit(main())
-"""
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('words', 'why'),
     [
@@ -386,17 +379,3 @@ def test_an_action_that_cannot_be_is_rejected(
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr
     assert why in ended.stderr
-
-
-@pytest.mark.slow
-def test_without_control_msgs_the_package_to_install_is_named(domain: int, tmp_path: Path) -> None:
-    words = ['shaper', '--shaper', 'none']
-    command = [sys.executable, '-c', NO_ACTION, *words, '--action', ACTION]
-    env_less = {'cwd': ROOT, 'capture_output': True, 'text': True, 'timeout': WAIT_S, 'check': False}
-    ended = subprocess.run(command, **env_less)  # type: ignore[call-overload]
-    assert ended.returncode == 3, ended.stderr
-    assert 'apt install ros-jazzy-control-msgs' in ended.stderr
-    # Without the parameter nobody needs it.
-    node = Program([sys.executable, '-c', NO_ACTION, *words])
-    node.until('publishing /shaper/shaped')
-    assert node.end() == 0

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import itertools
 import queue
-import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,7 @@ from hypothesis import strategies as st
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import INFO, WARNING, null_log, texts
 from psd_deflection.devices import contract_frames, port_source
-from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, SampleFrame, encode
+from psd_deflection.devices.protocol.frames import HelloFrame, PongFrame, SampleFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, RESTART
@@ -28,7 +27,6 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading import acquisition as module
 from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.reading.arrivals import Annotation, Arrival, Ended, Item, Restarted
-from psd_deflection.run.reading.pinger import UNANSWERED
 from test.heard import WAIT_S
 
 pytestmark = pytest.mark.slow
@@ -540,35 +538,3 @@ def test_a_ping_is_answered_and_bounds_the_delay(monkeypatch: pytest.MonkeyPatch
     # The last one was asked when nothing more came.
     assert (acquisition.counters.pings, acquisition.counters.pongs) == (30, 29)
     assert acquisition.clock_state().round_trip_ns == 500_000_000
-
-
-def test_a_device_that_answers_no_ping_is_left_in_peace(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Asked(UNANSWERED + 30, knows=False)
-    counters = pinged(source, monkeypatch).counters
-    assert (source.asked, counters.pings, counters.pongs) == (UNANSWERED, UNANSWERED, 0)
-
-
-def test_a_device_that_cannot_be_asked_is_not_asked_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Asked(30, knows=False, can_be_asked=False)
-    assert (pinged(source, monkeypatch).counters.pings, source.asked) == (0, 1)
-
-
-@pytest.mark.parametrize(
-    ('t_us', 'why'), [(None, r'no sample for'), (2**53 + 1, r'bytes but no sample \(5 bad frames: body does not fit')]
-)
-def test_a_silence_says_which_frames_came_instead(
-    device: Any, run: Run, sample: Any, monkeypatch: pytest.MonkeyPatch, t_us: int | None, why: str
-) -> None:
-    size = 0
-    if t_us is not None:
-        frames = FrameDecoder().feed(b'\x00' + b''.join(encode(sample(s, t_us)) for s in range(5)))
-        run.acquisition.feed(frames, 0)
-        size = 100
-    monkeypatch.setattr(run.acquisition.source, 'wake', lambda: None)
-    # What the reader does at a silence, with bytes in its last read: a device cannot be made to send just then.
-    silent = run.acquisition._silent
-    silent(size, 0)
-    assert re.search(why, run.heard('still listening'))
-    silent(size, 10**12)
-    # The frames are those since the last line.
-    assert ('baud rate' in run.heard('still listening')) == bool(size)

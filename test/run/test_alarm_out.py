@@ -227,6 +227,7 @@ def test_a_replay_hands_on_its_alarms(server: Server, tmp_path: Path, capsys: py
     assert '--watch-command = ' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_no_recording_makes_a_replay_run_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Parameters of a stranger's recording are no commands of the user's."""
     made = tmp_path / 'made'

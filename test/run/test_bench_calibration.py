@@ -65,6 +65,7 @@ class Bench:
             yield step
 
 
+@pytest.mark.slow
 def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) -> None:
     bench = Bench(bag, tmp_path / 'growing')
     first, half, full = list(bench.steps())

@@ -164,6 +164,7 @@ def stamped(clock_us: list[int]) -> list[int]:
     return late
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('share', [0.0, 0.5, 0.98])
 def test_a_clock_that_stands_still_or_crawls_is_laid_anew(share: float) -> None:
     late = stamped([min(k, 500) * 1000 + round(max(k - 500, 0) * 1000 * share) for k in range(12_000)])

@@ -178,6 +178,7 @@ def test_estimates_flow_while_the_disk_hangs_at_the_start_of_a_recording(live: L
     assert main(['replay', str(folder), '--compare']) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('where', ['write', 'fsync'])
 def test_estimates_flow_while_the_disk_hangs_in_a_recording(live: Live, disk: Disk, where: str) -> None:
     folder = live.record(True)
@@ -194,6 +195,7 @@ def test_estimates_flow_while_the_disk_hangs_in_a_recording(live: Live, disk: Di
     assert blocks_of(folder) == list(range(BLOCKS, 3 * BLOCKS))
 
 
+@pytest.mark.slow
 def test_estimates_flow_while_the_disk_hangs_at_the_end_of_a_recording(live: Live, disk: Disk) -> None:
     first = live.record(True)
     live.flow()

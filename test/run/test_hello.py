@@ -246,18 +246,6 @@ def test_a_clock_that_stands_still_is_reported_and_stamps_follow_the_host(monkey
     assert len(logged) <= 2 * (module.NEWS + 3)
 
 
-def test_the_kept_words_are_the_same_for_a_port_of_bytes(device: Any, rig: Rig) -> None:
-    body = json.dumps(info(serial='\ud800', firmware='\x1b[31m')).encode()
-    device.answer = sealed(b'\x10\x01' + body)
-    acquisition = Acquisition(rig, null_log)
-    acquisition.open()
-    try:
-        assert acquisition.hello is not None
-        assert (acquisition.hello.info['serial'], acquisition.hello.info['firmware']) == ('\\ud800', '\\x1b[31m')
-    finally:
-        acquisition.stop()
-
-
 @pytest.mark.parametrize('rate', ['1' + 309 * '0', 'NaN', '1e999'])
 def test_no_rate_on_the_wire_ends_the_reader(device: Any, rig: Rig, rate: str) -> None:
     text = json.dumps(info(sample_rate_hz=12345)).replace('12345', rate)

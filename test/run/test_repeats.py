@@ -48,25 +48,6 @@ def test_the_first_few_are_reported_one_by_one_and_so_is_what_comes_after_a_quie
     assert logged[3:] == ['2 more in the last 99998 s: gone 4', 'gone again']
 
 
-def test_lines_that_are_reported_at_once_make_the_next_wait_no_longer() -> None:
-    logged: list[str] = []
-    rate_limited_log = RateLimitedLog(texts(logged.append))
-    for k in range(6):
-        rate_limited_log.log('following', 'following', WARNING, float(k), at_once=6)
-    rate_limited_log.log('following', 'following', WARNING, 6.0, at_once=6)
-    assert len(logged) == 6
-    rate_limited_log.settle(5.0 + FIRST_WAIT_S)
-    assert logged[6:] == ['1 more in the last 10 s: following']
-
-
-def test_one_kind_does_not_hold_up_another() -> None:
-    logged: list[str] = []
-    rate_limited_log = RateLimitedLog(texts(logged.append))
-    rate_limited_log.log('a', 'one', WARNING, 0.0)
-    rate_limited_log.log('b', 'two', WARNING, 0.0)
-    assert logged == ['one', 'two']
-
-
 def test_a_new_reason_is_reported_at_once_and_takes_no_count_of_another() -> None:
     logged: list[str] = []
     rate_limited_log = RateLimitedLog(texts(logged.append))

@@ -109,6 +109,7 @@ def test_memory_is_reported_before_the_first_block_soon_and_then_every_ten_secon
     assert max(len(json.dumps(text)) for text in reported) < 150_000
 
 
+@pytest.mark.slow
 def test_reporting_the_memory_changes_no_record(running: Running) -> None:
     silent = Pipeline(running.rig)
     records: list[Record] = []

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import queue
-import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -142,17 +141,6 @@ def test_no_zero_is_taken_of_a_device_that_has_reported_nothing_for_long(
     monkeypatch.setattr(module, 'SILENT_S', -1e3)
     with pytest.raises(TimeoutError, match='no data flows'):
         running.session.zero()
-
-
-def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDevice) -> None:
-    logged: list[str] = []
-    rig = load_rig(
-        overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'dynamics.torsion_frequency': 9.0}
-    )
-    Session(rig, texts(logged.append)).close()
-    (line,) = [text for text in logged if 'as in the thesis rig' in text]
-    assert re.search(r'the same: \S+ = .* and \d+ more \(`psd-deflection params` lists them\)$', line)
-    assert len(line) <= 160
 
 
 class Observed:

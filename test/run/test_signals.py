@@ -9,8 +9,7 @@ import io
 import os
 import signal
 import threading
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -107,34 +106,3 @@ def test_display_survives_a_closed_terminal(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr('sys.stderr', heard)
     display.log('heard')
     assert heard.getvalue() == 'heard\n'
-
-
-def test_display_of_a_new_session_counts_from_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, counters = [100.0], SimpleNamespace(samples=0)
-    rates: list[float] = []
-
-    def line(session: Session, rate: float) -> str:
-        rates.append(rate)
-        return ''
-
-    monkeypatch.setattr('psd_deflection.cli._display.time', SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr('psd_deflection.cli._display.live_line', line)
-    display = Display()
-    session = cast(Session, SimpleNamespace(acquisition=SimpleNamespace(counters=counters)))
-    for counters.samples in (0, 50_000, 10, 10_010):
-        display.update(session)
-        now[0] += 100.0
-    assert [rate if rate == rate else None for rate in rates] == [None, 500.0, None, 100.0]
-
-
-def test_a_journal_gets_a_line_a_minute_in_the_long_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    heard, now = io.StringIO(), [100.0]
-    monkeypatch.setattr('sys.stderr', heard)
-    monkeypatch.setattr('psd_deflection.cli._display.time', SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr('psd_deflection.cli._display.live_line', lambda session, rate: f'{now[0] - 100.0:.0f} s')
-    display = Display()
-    session = cast(Session, SimpleNamespace(acquisition=SimpleNamespace(counters=SimpleNamespace(samples=0))))
-    while now[0] < 400.0:
-        display.update(session)
-        now[0] += 0.5
-    assert heard.getvalue().splitlines() == [f'{s} s' for s in (0, 5, 15, 35, 75, 135, 195, 255)]

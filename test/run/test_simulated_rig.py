@@ -70,6 +70,7 @@ def test_it_hangs_what_is_noted() -> None:
     session.note_load(0.0, -10.0, 0.0)
 
 
+@pytest.mark.slow
 def test_on_the_demo_weights_hang_in_turn() -> None:
     session, observed = running(demo=True)
     try:

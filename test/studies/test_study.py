@@ -29,7 +29,6 @@ from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LoopResult
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import StudyResult
-from psd_deflection.studies.watch.from_recordings import watch
 from psd_deflection.studies.watch.result import WatchedRun
 from test.studies.discover.test_plants import Spring
 
@@ -129,12 +128,6 @@ def test_a_result_draws_itself_and_is_a_table(kind: str, tmp_path: Path) -> None
     assert list(frame.attrs['units']) == [frame.index.name, *frame.columns]
 
 
-def test_only_an_axis_of_time_has_its_words() -> None:
-    files = Path(psd_deflection.__file__).parent.rglob('*.py')
-    message = [path.name for path in files if 'time / s' in path.read_text(encoding='utf-8')]
-    assert message == ['charts.py'], 'a chart over time takes a TimeAxis, which has the marks'
-
-
 @pytest.mark.parametrize('kind', ['Calibrated', 'Discovery', 'Identified', 'LoopResult', 'Validated'])
 @pytest.mark.filterwarnings('ignore:.*lacks its parameters')
 def test_every_chart_over_time_shows_the_marks(kind: str, tmp_path: Path) -> None:
@@ -152,20 +145,6 @@ def over_time(result: StudyResult) -> Iterator[Panel]:
     for drawing in result.drawings():
         if isinstance(drawing, Chart):
             yield from (panel for panel in drawing.panels if isinstance(panel.over, TimeAxis))
-
-
-def test_the_watch_shows_a_mark_before_its_first_alarm() -> None:
-    recording = psd_deflection.simulate(
-        psd_deflection.load_rig(),
-        [(0, 0, 0)],
-        seconds=20.0,
-        effects={'laser_pointing_drift': {'psd': 1, 'rate_x': 3e-7}},
-    )
-    vars(recording)['marks'] = lambda: [Mark(500_000_000, 'bumped')]
-    result = watch(recording, recording.known, {})
-    panel, *_ = over_time(result)
-    assert [(rule.at, rule.words) for rule in panel.marked(words=True)] == [(0.5, 'bumped')]
-    assert result.seconds == pytest.approx(19.999)
 
 
 def test_a_drawing_that_is_not_there_is_rejected() -> None:

@@ -107,6 +107,7 @@ def assert_agrees(found: EndEffector, truth: FloatArray, share: float) -> None:
 CASES = [pytest.param(case.link, id=case.what) for case in table_b1_cases()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('link', CASES)
 def test_point_d_of_appendix_b(link: TwinLink) -> None:
     chain = Chain([ChainLink('BC', IDENTITY, link.statics)], shift(link.length, 0.0, 0.0))

@@ -102,6 +102,7 @@ class Loop:
         return float(np.linalg.norm(self.plant.end().deflected.position - rigid.position))
 
 
+@pytest.mark.slow
 def test_a_payload_is_compensated_to_one_part_in_hundred(arm: Arm) -> None:
     loop = Loop(arm)
     loop.plant.force = PAYLOAD
@@ -146,6 +147,7 @@ def test_offsets_stay_within_their_limits(arm: Arm) -> None:
     assert command.limited
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('limit', [-2.0, 2.0])
 @pytest.mark.parametrize('up', [1.0, -1.0])
 def test_a_joint_is_not_sent_beyond_its_limit(arm: Arm, limit: float, up: float) -> None:
@@ -339,6 +341,7 @@ def test_two_nodes_that_report_different_joints_hold_the_offsets(arm: Arm) -> No
     assert np.array_equal(command.offsets[1:], before[1:]) or loop.step() <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('step', [3600.0, -3600.0])
 def test_a_clock_that_is_set_holds_the_offsets_for_some_estimates_only(arm: Arm, step: float) -> None:
     """That of the estimator and ours: the stamps change, and their ages do not."""
@@ -386,6 +389,7 @@ def test_offsets_that_are_held_for_long_go_back_to_zero(arm: Arm) -> None:
     assert loop.step() <= 1.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_offsets_of_an_arm_that_stands_stay_however_long_it_does(arm: Arm) -> None:
     """If they went back meanwhile, it would leap by all of them when it runs again."""
     loop = following(arm)
@@ -426,6 +430,7 @@ def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:
     assert loop.run(1.0).state is State.FOLLOWING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('how', [{}, {'takeover': True}, {'output': 'commands'}], ids=repr)
 def test_an_arm_that_reports_seldom_is_not_taken_for_one_that_does_not_follow(arm: Arm, how: dict[str, Any]) -> None:
     loop = following(arm, stale=0.5, jump=1.0, **how)
@@ -438,6 +443,7 @@ def test_an_arm_that_reports_seldom_is_not_taken_for_one_that_does_not_follow(ar
     assert np.abs(command.offsets - before).max() > 0.02
 
 
+@pytest.mark.slow
 def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
     """After a kill and a restart the controller still has the offsets of before, and nobody enabled the new one."""
     loop = following(arm)
@@ -478,6 +484,7 @@ def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> 
     assert loop.step() <= 1.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_a_controller_that_starts_again_without_offsets_is_sent_no_step(arm: Arm) -> None:
     """It ends, so nothing is sent. It comes back with none, and is led from there to those that are needed."""
     loop = reporting(arm)
@@ -559,6 +566,7 @@ def noisy(sd: float, step: float = 0.0) -> Callable[[FloatArray], FloatArray]:
     return measured
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('how', [{}, {'takeover': True}, {'output': 'commands'}], ids=repr)
 @pytest.mark.parametrize('encoder', [(0.0, 0.0), (1e-4, 0.0), (0.0, 3e-4), (2e-5, 1e-4)], ids=repr)
 @pytest.mark.parametrize('applies', [-1.0, 0.0, 0.3, 0.7, 1.0, 1.35, 2.0])
@@ -613,6 +621,7 @@ def test_a_controller_that_changes_its_scale_holds(arm: Arm) -> None:
     assert math.isnan(command.residual)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('delayed', [0.0, 0.02, 0.3])
 def test_an_arm_that_moves_by_itself_is_not_blamed(arm: Arm, delayed: float) -> None:
     """Motions begin with the loads that they cause, of all sizes; then the slope is as it was."""
@@ -644,6 +653,7 @@ def test_with_commands_the_arm_keeps_the_pose_that_it_had(arm: Arm) -> None:
     assert loop.step() <= 1.0 + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('droop', [0.0, 0.005])
 def test_with_commands_it_begins_at_the_command_of_the_controller(arm: Arm, droop: float) -> None:
     """However far the servos leave the joints below it, and however often it is enabled."""

@@ -261,6 +261,7 @@ def test_shapers_in_series_end_both_modes() -> None:
     assert both.residual(21.0, 0.01)[0] < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
 def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
     assert shapers.residual(shaper(kind, wrong * shapers.FREQUENCY, shapers.RATIO)) < 0.05
@@ -309,6 +310,7 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
     return largest_step_in_time(at.tolist(), commands, fastest, late if in_time else ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('orders', [1, 2, 3])
 def test_however_long_messages_take_a_replacement_makes_no_step(orders: int) -> None:
     """Latencies of a median of 4 ms, and of up to 57 ms, as they were measured."""
@@ -321,6 +323,7 @@ def test_however_long_messages_take_a_replacement_makes_no_step(orders: int) -> 
     assert orders == 3 or replaced(orders, 0.0, latencies) > 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('orders', [1, 2])
 def test_a_message_that_comes_after_the_lead_is_a_step_and_the_only_one(orders: int) -> None:
     """The shaper cannot know when a message arrives: one that has begun by then is joined in its middle."""

@@ -191,6 +191,7 @@ def test_what_is_encoded_is_decoded(frame: GoodFrame) -> None:
     assert decode(encode(frame)) == [frame]
 
 
+@pytest.mark.slow
 @given(streams, st.lists(st.integers(0, 2000), max_size=20))
 def test_any_split_of_the_stream_gives_the_same_frames(stream: bytes, cuts: list[int]) -> None:
     full = FrameDecoder().feed(stream)
@@ -238,6 +239,7 @@ def samples_of_some(draw: st.DrawFn) -> tuple[SampleFrame, bool]:
     return SampleFrame(flags, seq, t_us, tuple(counts)), wide
 
 
+@pytest.mark.slow
 @given(samples_of_some(), st.integers(2, MOST_PSDS))
 def test_a_sample_of_any_number_of_psds_comes_back_and_no_other_is_taken(
     sample: tuple[SampleFrame, bool], psds: int

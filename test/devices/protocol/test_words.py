@@ -57,6 +57,7 @@ def test_printable_is_printable_bounded_and_stays(text: str, longest: int) -> No
     assert sanitize(shown, longest) == shown
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.text(st.characters()), JSON, max_size=6))
 def test_any_words_become_harmless_and_stay(info: dict[str, Any]) -> None:
     words = device_words(info)
@@ -71,6 +72,7 @@ def test_what_is_no_finite_number(value: object) -> None:
     assert positive(value) is None
 
 
+@pytest.mark.slow
 @given(JSON)
 def test_a_hello_and_a_line_of_any_json_are_harmless(value: Any) -> None:
     text = json.dumps({'serial': value})

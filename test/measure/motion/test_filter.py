@@ -54,6 +54,7 @@ def noise_of_poses(a: int, b: int) -> FloatArray:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('count', [1, 2])
 def test_what_axes_share_is_the_noise_of_the_readings_through_the_gains(count: int) -> None:
     pose, velocity = np.zeros((2, count, 3, N))

@@ -170,6 +170,7 @@ def off(run: motion.Run, motions: list[TipMotion]) -> tuple[float, float]:
     return motion.rms(errors), motion.rms(np.sqrt([m.velocity_covariance[4] for m in part]))
 
 
+@pytest.mark.slow
 def test_the_filter_foretells_what_a_turning_joint_does(run: motion.Run) -> None:
     reported, untold = Pipeline(motion.rig_of()), Pipeline(motion.rig_of())
     with_it, own = off(run, moved(through(reported, run, range(100))))
@@ -195,6 +196,7 @@ def test_lost_lasers_are_coasted_through_with_what_is_reported(run: motion.Run) 
     assert error < 0.1 * np.abs(run.pose[:, 1]).max()
 
 
+@pytest.mark.slow
 def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the process noise stated and no doubt the filter is linear: late or not, it finds the same in the end."""
     monkeypatch.setattr(inertia, 'SHARE', 0.0)

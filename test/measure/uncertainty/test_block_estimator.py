@@ -82,17 +82,6 @@ def test_of_a_flat_plate_the_residual_is_computed_anew() -> None:
         assert PlateModel(rig, range(3), tilts).residual(tuple(dots.tolist()), reported) == reported
 
 
-def test_words_say_the_noise_of_each_reading_beside_the_rig_files() -> None:
-    """In um, of a sample and of a mean of twenty, which has the root of a twentieth of it."""
-    rig = rig_of(2, {'psd_1.noise': [4e-3, 2e-3], 'converter.bits': 24, 'psd_2.sensitivity': [1e-3, 5e-4]})
-    words = dict(BlockEstimator(rig).noise_words())
-    assert list(words) == [f'noise of {name} (um)' for name in ('x1', 'y1', 'x2', 'y2')]
-    for name, um in (('x1', 2.0), ('y1', 1.0), ('x2', 2.0), ('y2', 1.0)):
-        mean = um / 20.0**0.5
-        message = f'{um:.3f} a sample (rig file {um:.3f}), {mean:.3f} a block ({mean:.3f})'
-        assert words[f'noise of {name} (um)'] == message
-
-
 def checked(of: BlockEstimator, dots: FloatArray, residual: FloatArray, covariance: FloatArray) -> ConsistencyResult:
     args = tuple(dots.tolist()), tuple(residual.tolist()), covariance, (0.0,) * 5
     return of.check(of.full, of.full.unexplained(*args), None)

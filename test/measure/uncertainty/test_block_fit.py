@@ -11,7 +11,7 @@ import pytest
 
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
-from psd_deflection.measure.uncertainty.combinations import combinations, combinations_of
+from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk
 from psd_deflection.rig.config import load_rig
 
@@ -228,37 +228,6 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
     assert misfits > 0
 
 
-@pytest.mark.parametrize('combination', range(3))
-@pytest.mark.parametrize(('square', 'sudden'), [(15.9, False), (16.1, True)])
-def test_motion_is_believed_at_once_from_four_standard_deviations_on(
-    combination: int, square: float, sudden: bool
-) -> None:
-    """Before, a thirteenth of what is beyond the noise, less 0.03 of it; the weight is tau^2/(tau^2 + v)."""
-    fit, turn, q = fitter(), combinations(PLACES), basis(SIZE)
-    fitted = fit.fit(ALL, square**0.5 * SIGMA * q[:, 2:3] * turn[combination])
-    at_the_stamp = float(turn[combination] @ fitted.dots)
-    followed = square**0.5 * SIGMA * _middle_of(q[:, 2])
-    tau = square - 1.0 if sudden else (square - 1.0) / 13.0 - 0.03
-    assert at_the_stamp / followed == pytest.approx(tau / (tau + 1.0), rel=1e-4)
-
-
-def _middle_of(column: FloatArray) -> float:
-    """Of a parabola over the places 0 ... 19, at 9.5."""
-    return float(np.polyval(np.polyfit(ALL - 9.5, column, 2), 0.0))
-
-
-@pytest.mark.parametrize(('share', 'misfit'), [(0.99, False), (1.01, True)])
-def test_a_block_misfits_from_five_standard_deviations_of_its_squares_on(share: float, misfit: bool) -> None:
-    """Of 20 samples and 5 orders 15 degrees of freedom: 15 + 5 sqrt(30). What is left is added as an error."""
-    fit, q = fitter(), basis(SIZE)
-    residual = (ALL - 9.5) ** 5.0 - q @ (q.T @ (ALL - 9.5) ** 5.0)
-    residual *= SIGMA * (share * (15.0 + 5.0 * 30.0**0.5)) ** 0.5 / float(np.linalg.norm(residual))
-    got = fit.fit(ALL, np.outer(residual, combinations(PLACES)[0]))
-    assert got.misfit == misfit
-    own = float(combinations(PLACES)[0] @ got.covariance @ combinations(PLACES)[0])
-    assert own == pytest.approx(SIGMA**2 / 20.0 + (float(residual @ residual) / 15.0 if misfit else 0.0), rel=1e-2)
-
-
 # ---- motion that goes on alike
 
 
@@ -290,29 +259,6 @@ def test_at_rest_the_memory_of_motion_adds_little_noise() -> None:
     z, sds = shaken(fitter(), 5.0, 0.0, 4000)
     assert np.std(z * sds) < 1.04 * SIGMA / SIZE**0.5 / 2.0**0.5 * 2.0**0.5
     assert np.mean(np.abs(z) < 1.959964) == pytest.approx(0.955, abs=0.012)
-
-
-@pytest.mark.parametrize('slots', [ALL, np.delete(ALL, [3, 11, 12])], ids=['all', 'gaps'])
-def test_in_motion_a_block_is_the_least_squares_polynomial_at_its_middle(slots: IntArray) -> None:
-    """So much motion that nothing is known of the coefficients: weights by dense least squares of order 4."""
-    gamma = white()
-    fit = BlockFit(SIZE, PLACES, PLACES)
-    fit.set_noise(gamma)
-    rng = np.random.default_rng(5)
-    u = (ALL - 9.5) / 9.5
-    for _ in range(200):
-        shape = np.polynomial.polynomial.polyvander(u, 4) @ rng.normal(size=(5, 4))
-        fit.fit(ALL, 1e-4 * shape + SIGMA * rng.normal(size=(SIZE, 4)))
-    dots = (1e-4 * shape + SIGMA * rng.normal(size=(SIZE, 4)))[slots]
-    got = fit.fit(slots, dots)
-    powers = np.polynomial.polynomial.polyvander(u[slots], 4)
-    w = np.linalg.pinv(powers)[0]
-    # The base line between the dots does not move, whatever the link does: there the mean may be better.
-    moving = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
-    # To second order in the motion: the length of the base line is taken exactly.
-    np.testing.assert_allclose(moving @ got.dots, moving @ (w @ dots), atol=2e-8)
-    want = SIGMA**2 * float(w @ w)
-    np.testing.assert_allclose((moving @ got.covariance @ moving.T).diagonal(), 2.0 * want, rtol=5e-3)
 
 
 @pytest.mark.parametrize(('size', 'coloured'), [(64, True), (65, False)])
@@ -349,6 +295,7 @@ def swaying(size: int, lost: tuple[int, ...] = ()) -> FloatArray:
     return np.array([(r.dy - 3e-4 * np.sin(88.0e-9 * r.t_ns + 0.3)) / r.covariance[4] ** 0.5 for r in found])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('size', [5, 6, 8, 11])
 def test_small_blocks_follow_motion_and_say_how_well(size: int) -> None:
     """With one order for four samples 0.31 of the intervals of blocks of 8 held the truth."""

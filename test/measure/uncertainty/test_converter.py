@@ -64,6 +64,7 @@ def test_a_coarse_channel_beside_fine_ones_is_that_channel() -> None:
     np.testing.assert_allclose(fed(samples).steps, [0.0, 0.0, 0.0, 0.0, TEN, 0.0], rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('step', 'noise', 'file'),
     [
@@ -97,6 +98,7 @@ def test_a_step_is_not_believed_before_thirty_samples_and_one_finer_value_ends_i
     assert not steps.steps.any()
 
 
+@pytest.mark.slow
 def test_ten_bits_untold_are_in_the_intervals() -> None:
     """The finding: 0.77 of the intervals of one axis held the truth."""
     s = coarse(24, reported=False)

@@ -54,6 +54,7 @@ def mean_variance(memory: float) -> float:
     return float((memory ** abs(lags[:, None] - lags)).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('memory', [0.0, 0.3, 0.6, 0.9])
 @pytest.mark.parametrize('lost', [(), (2, 3, 11)], ids=['all', 'gaps'])
 def test_the_variance_of_a_mean_is_found_with_its_colour(memory: float, lost: tuple[int, ...]) -> None:
@@ -63,13 +64,6 @@ def test_the_variance_of_a_mean_is_found_with_its_colour(memory: float, lost: tu
     assert rested(noise)
     np.testing.assert_allclose(noise.mean_sd(), 2.0 * SIGMA * mean_variance(memory) ** 0.5, rtol=0.12)
     np.testing.assert_allclose(noise.sample_sd(), 2.0 * SIGMA, rtol=0.06)
-
-
-def test_until_two_segments_came_it_is_the_rig_files() -> None:
-    noise = stream()
-    feed(noise, coloured(2 * SEGMENT - SIZE, 0.0, 5, 3.0 * SIGMA))
-    assert not noise.measured
-    np.testing.assert_allclose(noise.sample_sd(), SIGMA, rtol=1e-3)
 
 
 def test_motion_is_not_taken_for_noise() -> None:
@@ -95,17 +89,6 @@ def test_a_rig_that_never_rests_takes_the_colour_from_the_base_line() -> None:
     np.testing.assert_allclose(noise.mean_sd(), SIGMA * mean_variance(0.6) ** 0.5, rtol=0.12)
 
 
-def test_more_noise_is_believed_after_three_segments_less_at_once() -> None:
-    noise = stream()
-    feed(noise, coloured(5 * SEGMENT, 0.0, 10))
-    feed(noise, coloured(2 * SEGMENT, 0.0, 11, 5.0 * SIGMA), 5 * SEGMENT_BLOCKS)
-    np.testing.assert_allclose(noise.sample_sd(), SIGMA, rtol=0.1)
-    feed(noise, coloured(SEGMENT, 0.0, 12, 5.0 * SIGMA), 7 * SEGMENT_BLOCKS)
-    np.testing.assert_allclose(noise.sample_sd(), 5.0 * SIGMA, rtol=0.1)
-    feed(noise, coloured(SEGMENT, 0.0, 13), 8 * SEGMENT_BLOCKS)
-    np.testing.assert_allclose(noise.sample_sd(), SIGMA, rtol=0.1)
-
-
 def test_one_spike_is_not_noise() -> None:
     noise = stream()
     feed(noise, coloured(5 * SEGMENT, 0.0, 14))
@@ -116,6 +99,7 @@ def test_one_spike_is_not_noise() -> None:
     assert (noise.gamma == before).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('sigma', 'seeds'), [(0.0, 1), (0.3, 1), (0.6, 1)])
 def test_the_error_of_a_mean_of_coarse_readings_is_inside_what_is_reported(sigma: float, seeds: int) -> None:
     """Steps of 10 um: over all places between two steps, the rms error of the mean is what is stated, or less."""
@@ -187,6 +171,7 @@ def _odd(name: str) -> FloatArray:
     return np.stack([one, -one, one, one], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('lost', [0, 5, 18])
 @pytest.mark.parametrize('step', [0.0, STEP])
 @pytest.mark.parametrize('name', ['constant', 'every other', 'hum alone', 'one block long', 'steps', 'spikes', 'walk'])
@@ -258,24 +243,6 @@ def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) 
 
 def steps_of(stated: float, step: float) -> FloatArray:
     return np.asarray(StreamNoise(SIZE, PLACES, PLACES, stated, step).gamma[0, 0])
-
-
-def test_the_least_noise_is_that_of_rounding_and_what_is_not_dithered_stays() -> None:
-    """q^2/12 a sample, and at every lag sum_k q^2/(2 pi^2 k^2) exp(-4 pi^2 k^2 s^2/q^2) for noise s."""
-    step = 2e-6
-    k = np.arange(1, 100_000)
-    for s in (0.0, 0.2e-6, 0.5e-6):
-        # The rig file's noise has the rounding in it.
-        stated = s**2 + step**2 / 12.0
-        stays = step**2 / (2.0 * np.pi**2) * float(np.sum(np.exp(-4.0 * (np.pi * k * s / step) ** 2) / k**2))
-        got = steps_of(stated, step)
-        np.testing.assert_allclose(got[1:], stays, rtol=6e-3, atol=1e-20)
-        assert got[0] - got[1] == pytest.approx(stated, rel=1e-9)
-    # Less than rounding there is not.
-    got = steps_of(0.0, step)
-    assert got[0] - got[1] == pytest.approx(step**2 / 12.0, rel=1e-9)
-    # Without a converter it is as stated.
-    np.testing.assert_array_equal(steps_of(3e-12, 0.0), [3e-12, *(0.0,) * (SIZE - 1)])
 
 
 def test_each_reading_has_its_own_steps_and_noise() -> None:

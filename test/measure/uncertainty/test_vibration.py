@@ -116,6 +116,7 @@ def chunk(volts: FloatArray, first: int = 0) -> RawChunk:
     return RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), np.uint8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('hz', [75.0, 87.0, 180.0, 480.0])
 def test_a_vibration_is_counted_and_named(hz: float) -> None:
     s = shaken(hz, seconds=8)

@@ -164,36 +164,6 @@ def test_other_light_and_a_clipped_spot_are_reported_of_the_detector() -> None:
             assert classify(dots=dots).findings == message
 
 
-def test_other_light_moves_a_dot_toward_its_own_centre_wherever_that_is() -> None:
-    """1 V too much of 6.5 V: the dot may be off by a share of it, evenly up to half the larger side."""
-    rig = load_rig(overrides={'sum_max': 6.0, 'psd_2.active_area': [6e-3, 8e-3]})
-    health = OpticsHealth(rig)
-    nominal = rig.amplifier.sum_nominal
-    assert health.background_variance((5.9,) * 2) == (0.0, 0.0)
-    first, second = health.background_variance((5.0, 6.5))
-    assert first == 0.0
-    rng = np.random.default_rng(0)
-    off = (6.5 - nominal) / 6.5 * rng.uniform(-4e-3, 4e-3, 400_000)
-    assert second == pytest.approx(float(np.var(off)), rel=0.01)
-
-
-def test_what_is_exactly_at_its_limit_is_still_good() -> None:
-    assert classify(changed(2, 2.0), sum_min=2.0).status is BlockStatus.OK
-    assert classify(changed(5, 6.0), sum_max=6.0).findings == ()
-    health = OpticsHealth(load_rig(overrides={'sum_max': 6.0}))
-    assert health.background_variance((6.0,) * 2) == (0.0, 0.0)
-    # One step below the last one.
-    assert classify(one=changed(0, 32766 * STEP)).status is BlockStatus.OK
-    # Half of 2^-6 m, and a spot of 2^-10 m that touches the edge: doubles without rounding.
-    edges: dict[str, Any] = {'psd_1.active_area': [2.0**-6] * 2, 'psd_1.spot_radius': 2.0**-10}
-    for axis in (0, 1):
-        touches = [0.0] * 4
-        touches[axis] = 2.0**-7 - 2.0**-10
-        assert classify(dots=tuple(touches), **edges) == Verdict(BlockStatus.OK, '', 0)
-        touches[axis] = 2.0**-7
-        assert classify(dots=tuple(touches), **edges).status is BlockStatus.OK
-
-
 def test_the_sound_detectors_are_those_without_a_fault_if_samples_are_enough() -> None:
     assert classify(changed(2, 0.0)).sound == (1,)
     assert classify(changed(5, 0.0)).sound == (0,)
@@ -254,12 +224,6 @@ def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
     assert rejects.late_findings(of(volts), ok, (5, 7), Loudness()) == ()
 
 
-def test_noise_of_just_a_step_may_stand_still() -> None:
-    volts = np.tile(np.array(GOOD, np.float32), (20, 1))
-    for noise, moves in ((20.0 / 65536.0, False), (20.1 / 65536.0, True)):
-        assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(of(volts)) == (moves, moves)
-
-
 def test_other_light_counts_over_each_detectors_own_area() -> None:
     """Of three, whose larger sides are 6, 8 and 10 mm."""
     areas = {f'psd_{n}.active_area': [2e-3 * n, 4e-3 + 2e-3 * n] for n in (1, 2, 3)}
@@ -267,18 +231,3 @@ def test_other_light_counts_over_each_detectors_own_area() -> None:
     share = (8.0 - rig.amplifier.sum_nominal) / 8.0
     want = [(share * half) ** 2 / 3.0 for half in (3e-3, 4e-3, 5e-3)]
     assert OpticsHealth(rig).background_variance((8.0,) * 3) == pytest.approx(want)
-
-
-def test_a_spot_at_a_corner_is_reported_once_and_the_faulty_psd_hides_no_other() -> None:
-    corner = (*DOTS[:2], 4.9e-3, -4.9e-3)
-    assert classify(dots=corner).findings == ('psd_2: the spot is clipped at the edge',)
-    dark = classify(changed(2, 0.0), corner)
-    assert dark.faulty == 1
-    assert dark.findings == ('psd_2: the spot is clipped at the edge',)
-
-
-def test_two_samples_can_be_still_and_one_cannot() -> None:
-    health = OpticsHealth(load_rig(overrides={'min_samples': 1}))
-    volts = np.tile(np.array(GOOD, np.float32), (2, 1))
-    assert health.still(of(volts)) == (True, True)
-    assert health.still(of(volts[:1])) == (False, False)

@@ -62,6 +62,7 @@ def test_light_pulls_the_reading_before_it_grows() -> None:
     assert by_budget == pytest.approx(by_simulation, rel=1e-14)
 
 
+@pytest.mark.slow
 @given(place, place, st.floats(0.0, 0.2), st.floats(-3000.0, 3000.0), share, share)
 def test_the_budget_reads_what_the_simulation_does(
     x: float, y: float, light: float, k: float, gain_x: float, gain_y: float
@@ -89,6 +90,7 @@ def test_the_budget_reads_what_the_simulation_does(
     assert got == pytest.approx(want, abs=1e-16)
 
 
+@pytest.mark.slow
 @given(place, place, st.floats(-0.1, 0.1), share, share, share, share, st.floats(-3000.0, 3000.0))
 def test_the_calibration_reads_what_the_simulation_does_and_finds_the_place_again(
     x: float, y: float, angle: float, gain_x: float, gain_y: float, xy: float, yx: float, k: float
@@ -143,6 +145,7 @@ PLACES = ('studies/budget/', 'arms/', 'cli/run/compensator.py', 'cli/studies/des
 """Where these words stand for something else."""
 
 
+@pytest.mark.slow
 def test_no_other_file_names_an_effect() -> None:
     names = set(effect_names())
     assert len(names) >= 30

@@ -38,15 +38,6 @@ def test_counts_become_volts_rounded_once() -> None:
     assert got[0].tolist() == [np.float32(c * (10.0 / 32768.0)) for c in counts[0].tolist()]
 
 
-def test_noise_is_the_amplifiers_and_the_converters() -> None:
-    rig = rig_from_values({'amplifier.noise': 2e-3, 'converter.bits': 8})
-    step = 20.0 / 256.0
-    rng = np.random.default_rng(0)
-    clean = rng.uniform(-5.0, 5.0, 200_000)
-    read = np.round((clean + 2e-3 * rng.standard_normal(clean.shape)) / step) * step
-    np.testing.assert_allclose(dot_noise_variances(rig), np.var((read - clean) * 0.5e-3), rtol=0.02)
-
-
 def test_each_channel_has_its_own_noise_and_sensitivity_and_zero_means_the_amplifiers() -> None:
     rig = rig_from_values({'psd_1.noise': [1e-3, 0.0], 'psd_2.noise': [4e-3, 3e-3], 'psd_2.sensitivity': [0.0, 1e-3]})
     step = 20.0 / 65536.0

@@ -44,6 +44,7 @@ def still(rig: Rig, pose: tuple[float, ...], n: int) -> FloatArray:
     return np.repeat(readings(p, np.array(pose)[:, None], rig.link.length).T, n, axis=0)
 
 
+@pytest.mark.slow
 def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
     """300 rigs drawn from the file's covariance show the same pose; the file knows none of them."""
     # Each rig is a jump for the one that measures; only the parameters are asked about.
@@ -68,6 +69,7 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
         assert message / np.outer(sd, sd) == pytest.approx(observed / np.outer(sd, sd), abs=0.25), name
 
 
+@pytest.mark.slow
 def test_the_polynomial_is_what_it_stands_for() -> None:
     from psd_deflection.model.misalignment.parameter_covariance import dots_by_parameters
 
@@ -109,6 +111,7 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     assert next(other.process(chunk_of(dots[600:], 600))) == records[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('blocks', [1, 2, 25])
 def test_the_variance_of_a_zero_is_that_of_its_blocks_over_their_number(blocks: int) -> None:
     """What scatters by more than the noise says is believed; of one block there is only what the noise says."""

@@ -63,11 +63,6 @@ def test_arrays_that_are_no_geometry_are_rejected(centers: np.ndarray, heights: 
         check_shapes(Geometry(centers, np.zeros(centers.shape), np.zeros(heights), 0.585))
 
 
-@pytest.mark.parametrize('count', [2, 3])
-def test_a_geometry_is_of_so_many_psds(count: int) -> None:
-    assert check_shapes(Geometry(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.585)) == count
-
-
 def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> None:
     """The rejection says where they are: at the first one's place."""
     for along in ((1.0, 0.0), (0.0, 1.0), (-0.6, 0.8)):
@@ -84,17 +79,3 @@ def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> Non
     assert check_twist(Geometry(np.zeros((3, 2)), zeros, np.zeros(3), 0.585)) == 3
     with pytest.raises(SolverError, match='psd_1 and psd_2 and psd_3 coincide'):
         check_twist(Geometry(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3), 0.585))
-
-
-@pytest.mark.parametrize('name', ['centers', 'zeros', 'heights'])
-def test_what_is_not_finite_is_named(name: str) -> None:
-    arrays = {'centers': np.zeros((2, 2)), 'zeros': np.zeros((2, 2)), 'heights': np.zeros(2)}
-    arrays[name].ravel()[1] = np.inf
-    with pytest.raises(SolverError, match=f'geometry: {name} must be finite'):
-        check_shapes(Geometry(arrays['centers'], arrays['zeros'], arrays['heights'], 0.585))
-
-
-def test_arrays_of_another_count_are_rejected_one_by_one() -> None:
-    for zeros, heights in (((3, 2), 2), ((2, 2), 3), ((2, 1), 2)):
-        with pytest.raises(SolverError, match='must all be of the same 2 PSDs'):
-            check_shapes(Geometry(np.zeros((2, 2)), np.zeros(zeros), np.zeros(heights), 0.585))

@@ -14,6 +14,7 @@ from psd_deflection.studies.thesis.appendix_d_least_squares import printed_desig
 from psd_deflection.studies.thesis.comparison import DIRECT, SIDEBAR, printed_bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('scaling', [(1.0,) * 4, SIDEBAR, DIRECT])
 @pytest.mark.parametrize('lacking', [0.0, 0.5e-3, 2e-3])
 def test_no_error_exceeds_the_bound(golden: Any, scaling: Any, lacking: float) -> None:

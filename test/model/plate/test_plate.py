@@ -134,16 +134,6 @@ def test_the_geometry_is_that_of_the_rig_file() -> None:
     assert (geometry.link_length, geometry.slope_ratio) == (0.4, 1.4)
 
 
-def test_places_are_lifted_whatever_the_shape() -> None:
-    one = lifted(np.array([1.0, 2.0]), 3.0)
-    assert one.tolist() == [1.0, 2.0, 3.0]
-    across = np.arange(24.0).reshape(4, 3, 2)
-    many = lifted(across, np.array([7.0, 8.0, 9.0]))
-    assert many.shape == (4, 3, 3)
-    assert many[2, 1].tolist() == [*across[2, 1], 8.0]
-    assert lifted(across[0, 0], np.array([1.0, 2.0])).tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 2.0]]
-
-
 @pytest.mark.parametrize('tilts', ['none', 'tied', 'bounded', 'free'])
 def test_readings_go_with_what_is_solved_for_as_differences_say(tilts: Tilts) -> None:
     """Of a flat plate whatever its heights and tilts; tied to the deflection; with tilts of their own."""

@@ -27,12 +27,3 @@ def test_the_plate_holds_the_detectors() -> None:
     assert first[0] == pytest.approx((0.0, 0.07, 0.0))
     assert first[1] == pytest.approx((0.008, 0.009, 0.002))
     assert second[0] == pytest.approx((-0.1, 0.0, 0.02))
-
-
-def test_the_plate_reaches_to_detectors_on_every_side_of_the_axis() -> None:
-    places = {'psd_1.center': [-0.02, -0.05], 'psd_2.center': [0.06, 0.03], 'psd_3.center': [0.01, -0.08]}
-    plate, *detectors = tip_boxes(load_rig(overrides=places))
-    # From -20 to 60 and from -80 to 30 mm, and 15 mm around.
-    assert plate[0] == pytest.approx((0.02, -0.025, 0.003))
-    assert plate[1] == pytest.approx((0.11, 0.14, 0.004))
-    assert [d[0][:2] for d in detectors] == [(-0.02, -0.05), (0.06, 0.03), (0.01, -0.08)]

@@ -24,7 +24,7 @@ from psd_deflection.measure.correction import Correction
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation import effects
-from psd_deflection.model.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names, effects_of_rig
+from psd_deflection.model.simulation.catalogue import FOLDERS, GROUP, catalogue, effect_names
 from psd_deflection.model.simulation.loads import sidebar
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import Counts, DeflectionEstimate, FloatArray, RawChunk
@@ -65,12 +65,7 @@ def poses(rig: Rig, counts: Counts) -> FloatArray:
     return np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])
 
 
-def test_it_is_in_the_catalogue(rig: Rig) -> None:
-    assert NAME in effect_names()
-    assert NAME in catalogue()
-    assert [a.label for a in effects_of_rig(rig)] == [f'{NAME} (psd 2)']
-
-
+@pytest.mark.slow
 def test_it_is_simulated_and_corrected(rig: Rig) -> None:
     load = np.tile(sidebar(50.0), (8000, 1))
     warm = np.full(len(load), 30.0)
@@ -204,8 +199,6 @@ def test_a_package_offers_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 LINK = {'bending_stiffness', 'torsional_stiffness', 'damping'}
 """Effects that have the name of what they change; it is a word of mechanics and of the fit as well."""
-SEARCH = {'amplitude', 'gain', 'psd'}
-"""Parameters that have the name of a kind of parameter, of a column of the report, and of a stage."""
 
 
 def words_of(path: Path) -> list[tuple[int, str]]:
@@ -225,34 +218,6 @@ def words_of(path: Path) -> list[tuple[int, str]]:
         elif isinstance(node, ast.ImportFrom):
             out += [(node.lineno, f'{node.module} {alias.name}') for alias in node.names]
     return out
-
-
-def test_no_other_file_names_an_effect() -> None:
-    places = Path(effects.__file__).parent
-    # The terms of the error budget are a list of their own; some have the name of the effect they are due to.
-    files = [
-        f for f in PACKAGE.rglob('*.py') if places not in f.parents and PACKAGE / 'studies' / 'budget' not in f.parents
-    ]
-    # A calibrated rig file has its parameters as effects.
-    files.remove(PACKAGE / 'model' / 'misalignment' / 'rig.py')
-    assert len(files) > 100
-    names = {f.stem for f in places.glob('[a-z]*.py')} - LINK
-    assert len(names) >= 26
-    named = re.compile(rf'\b({"|".join(sorted(names))})\b')
-    assert [(str(f), *w) for f in files for w in words_of(f) if named.search(w[1])] == []
-
-
-def test_discovery_names_no_parameter_of_an_effect() -> None:
-    parameters = {p.name for e in catalogue().values() for p in e.parameters} - SEARCH
-    texts = [
-        (file.name, node.lineno, node.value)
-        for file in (PACKAGE / 'studies' / 'discover').rglob('*.py')
-        for node in ast.walk(ast.parse(file.read_text(encoding='utf-8')))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    ]
-    assert len(texts) > 100
-    assert [t for t in texts if t[2] in parameters] == []
-    assert [t for t in texts if t[2].startswith(('amplitude_', 'phase_'))] == []
 
 
 HEAVY = ('scipy.signal', 'scipy.special', 'scipy.optimize', 'scipy.stats', 'matplotlib', 'pandas')

@@ -94,6 +94,7 @@ EVERY = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('length', LENGTHS)
 @pytest.mark.parametrize('active', EVERY)
 def test_it_does_what_the_second_formula_says(active: ActiveEffect, length: float) -> None:

@@ -16,7 +16,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.correction import Correction
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation import loads
-from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, effects_to_values, make_active
+from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.model.simulation.hysteresis import play
 from psd_deflection.model.simulation.physics import Physics
@@ -93,6 +93,7 @@ def test_in_pieces_bit_for_bit(active: ActiveEffect) -> None:
     assert np.array_equal(np.concatenate(got), full.counts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('active', EVERY)
 def test_a_rig_file_carries_it_there_and_back(active: ActiveEffect, tmp_path: Path) -> None:
     path = tmp_path / 'model.yaml'
@@ -161,20 +162,6 @@ def test_the_correction_gives_back_what_the_nominal_rig_shows(name: str, values:
     assert after < 1e-3 * before
 
 
-def test_all_corrections_together() -> None:
-    values: dict[str, object] = {}
-    for i, (name, parameters) in enumerate(CORRECTABLE):
-        if name == 'sensor_position' and parameters.get('aimed') == 0:
-            continue
-        values[f'effects.e{i}.name'] = name
-        values.update({f'effects.e{i}.{k}': v for k, v in parameters.items()})
-    rig = rig_from_values(values)
-    observed, nominal = ForwardModel(rig).run(HISTORY, WARM), ForwardModel(RIG).run(HISTORY, WARM)
-    after = Correction.from_rig(rig).apply(observed.dots.T, observed.sums.T, observed.warmer, observed.t).T
-    assert np.abs(after - nominal.dots).max() < 1e-7
-    assert np.abs(observed.dots - nominal.dots).max() > 1e-5
-
-
 LOADS = ((10.0, -25.0, -12.0), (20.0, -40.0, -20.0), (-5.0, 10.0, 8.0))
 HELD_S = 7
 
@@ -204,14 +191,3 @@ def test_the_wrench_is_the_load(active: ActiveEffect) -> None:
     assert (np.abs(found - LOADS) < 1e-3 * size).all()
     moved = np.abs(volts[-1] - nominal[-1]).max() > 0.05
     assert not moved or (np.abs(blind - LOADS) > 1e-3 * size).any()
-
-
-def test_effect_parameters_are_declared_soundly() -> None:
-    for effect in catalogue().values():
-        assert effect.summary
-        assert effect.equation
-        assert effect.source
-        assert effect.needs
-        for p in effect.parameters:
-            assert p.description
-    assert make_active('creep', {'amplitude': 0.1}, 'test').values['time_constant'] == 5.0

@@ -207,6 +207,7 @@ def test_a_lag_is_exact_just_after_a_load_step_too(tau: float) -> None:
     np.testing.assert_allclose(effect_volts(lag, skew)[:3], late[:, :-1:FINER], rtol=0.0, atol=3e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['mains_interference', 'amplifier_lag', 'channel_skew', 'sensor_rotation'])
 def test_samples_that_nobody_needs_leave_no_circle_in_memory(name: str) -> None:
     # A search makes hundreds of them, each of tens of megabytes.

@@ -75,6 +75,7 @@ def agree(solver: Any, dots: np.ndarray[Any, Any], variances: tuple[float, ...],
         np.testing.assert_array_equal(np.array(again[:5]), np.array(one[:5]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', VARIANCES)
 @pytest.mark.parametrize(('method', 'options'), [*SMOOTH, *STEPPED])
 def test_one_block_and_many_agree(golden: Any, rays: Any, method: str, options: dict[str, Any], kind: str) -> None:

@@ -312,34 +312,6 @@ def test_the_arrangement_is_reported_by_the_rig_or_by_the_name_of_the_solver_alo
             solver_from_rig(rig.estimator.solver, rig)
 
 
-@pytest.mark.parametrize(('apart', 'taken'), [(0.9e-6, False), (1.1e-6, True)])
-def test_planes_closer_than_a_micrometre_are_one(apart: float, taken: bool) -> None:
-    """Of three PSDs at the tip and of two at the base. Just above, what noise makes of it is another matter."""
-    heights = np.array([0.0, apart, 0.0])
-    staggered = Geometry(THREE.centers, THREE.zeros, heights, 0.585)
-    planes = Geometry(AT_THE_BASE.centers, AT_THE_BASE.zeros, np.array([-0.5, -0.5 - apart]), 0.585)
-    if taken:
-        make_solver('pose', staggered)
-        with pytest.raises(SolverError, match='some motion of the tip moves no dot'):
-            make_solver('base_pair', planes, assume='no_twist')
-        return
-    with pytest.raises(SolverError, match='coplanar'):
-        make_solver('pose', staggered)
-    with pytest.raises(SolverError, match='all PSD planes'):
-        make_solver('base_pair', planes, assume='no_twist')
-
-
-@pytest.mark.parametrize(('gain', 'taken'), [(0.9e-3, False), (1.1e-3, True), (-0.9e-3, False), (-1.1e-3, True)])
-def test_a_deflection_that_moves_a_dot_by_less_than_a_thousandth_is_unseen(gain: float, taken: bool) -> None:
-    """1 - k L_i/L, by which a dot at the base follows the deflection."""
-    geometry = Geometry(AT_THE_BASE.centers, AT_THE_BASE.zeros, np.full(2, -0.5), 0.5, 1.0 - gain)
-    if taken:
-        make_solver('base_pair', geometry)
-    else:
-        with pytest.raises(SolverError, match='the deflection cannot be seen'):
-            make_solver('base_pair', geometry)
-
-
 def test_options_come_from_the_rig_file() -> None:
     """Each has another answer, or another rejection, than the default."""
     base = {'solver': 'base_pair', 'solvers': ['base_pair'], 'degraded': 'none'}
@@ -375,20 +347,6 @@ def test_a_quarter_turn_has_a_way_out_of_where_no_angle_is_better() -> None:
     assert one[:3] == pytest.approx((0.0, 0.0, np.pi / 2.0), abs=1e-14)
 
 
-def test_a_link_without_end_and_a_weight_without_end_are_rejected() -> None:
-    for length in (0.0, -1.0, float('inf')):
-        with pytest.raises(SolverError, match=r'link\.length = .* must be above 0'):
-            make_solver('beam', Geometry(TWO.centers, TWO.zeros, TWO.heights, length))
-    for k in (float('inf'), float('-inf'), float('nan')):
-        with pytest.raises(SolverError, match=r'link\.slope_ratio = .* must be finite'):
-            make_solver('beam', Geometry(TWO.centers, TWO.zeros, TWO.heights, 0.585, k))
-    for bad in (0.0, -1.0, float('inf'), float('nan')):
-        for at in range(4):
-            scaling = tuple(bad if i == at else 1.0 for i in range(4))
-            with pytest.raises(ConfigError, match='must have 4 elements above 0'):
-                make_solver('wls', TWO, weights='thesis', row_scaling=scaling)
-
-
 def test_the_thesis_weights_are_of_two_psds() -> None:
     third = {'psd_3.center': [0.08, -0.06]}
     for name in ('wls', 'wls_exact'):
@@ -396,20 +354,6 @@ def test_the_thesis_weights_are_of_two_psds() -> None:
         solver_from_rig(name, rig_from_values({'wls.weights': 'thesis'}))
         with pytest.raises(ConfigError, match='its weights are of two PSDs, the rig has 3'):
             solver_from_rig(name, rig_from_values({**third, 'wls.weights': 'thesis'}))
-
-
-def test_a_psd_at_the_base_stands_below_the_tip_section() -> None:
-    """Named by its number; the one at the section itself is rejected."""
-    for at in (0, 1):
-        for height, taken in ((-0.3, True), (0.0, False), (0.3, False)):
-            heights = np.array([-0.5, -0.4])
-            heights[at] = height
-            geometry = Geometry(AT_THE_BASE.centers, AT_THE_BASE.zeros, heights, 0.585)
-            if taken:
-                make_solver('base_pair', geometry)
-            else:
-                with pytest.raises(SolverError, match=rf'psd_{at + 1}\.height = {height:g} m: a PSD at the base'):
-                    make_solver('base_pair', geometry)
 
 
 def test_three_psds_at_the_base_in_two_planes_give_five_unknowns(rays: Any) -> None:

@@ -104,35 +104,6 @@ def test_a_method_is_weighted_least_squares_of_its_model(
         np.testing.assert_allclose(stated_gain / size, gain[:3] / size, atol=gain_within)
 
 
-def test_the_thesis_weights_are_a_fixed_gain(rays: Any) -> None:
-    """x = (A^T W A)^-1 A^T W (m - m_0) with W = Po^2, whatever the noise; covariance G V G^T."""
-    po = np.array([0.03, 0.5, 10.0, 0.1])
-    of = linear(rays, TWO)
-    design = np.stack([of(e) - of(np.zeros(3)) for e in np.eye(3)], axis=1)
-    for method, options, scaling in (('wls', {'weights': 'thesis'}, po), ('ols', {}, np.ones(4))):
-        w = np.diag(scaling**2)
-        gain = np.linalg.inv(design.T @ w @ design) @ design.T @ w
-        dots = of(np.array([2e-3, -1e-3, 0.01])) + np.array([1e-5, -2e-5, 3e-5, 1e-5])
-        solver = make_solver(method, TWO, **options)
-        got = solver.solve(tuple(dots.tolist()), VARIANCES[:4])
-        x = gain @ (dots - TWO.zeros.ravel())
-        np.testing.assert_allclose(got[:3], x, rtol=1e-9)
-        want = gain @ np.diag(VARIANCES[:4]) @ gain.T
-        np.testing.assert_allclose(np.reshape(got.covariance, (3, 3)), want, rtol=1e-8, atol=1e-20)
-        np.testing.assert_allclose(got.residual, dots - of(x), atol=1e-12)
-        np.testing.assert_allclose(solver.gain(tuple(dots.tolist()), VARIANCES[:4], got), gain, rtol=1e-8, atol=1e-10)
-
-
-@pytest.mark.parametrize(('apart', 'taken'), [(0.9e-6, False), (1.1e-6, True)])
-def test_beams_closer_than_a_micrometre_are_one(apart: float, taken: bool) -> None:
-    geometry = Geometry(np.array([[0.0, 0.07], [0.0, 0.07 + apart]]), np.zeros((2, 2)), np.zeros(2), 0.585)
-    if taken:
-        make_solver('exact', geometry)
-    else:
-        with pytest.raises(SolverError, match='coincide'):
-            make_solver('exact', geometry)
-
-
 @pytest.mark.parametrize(('deviations', 'status'), [(2.9, SolverStatus.OK), (3.1, SolverStatus.INADMISSIBLE)])
 def test_a_base_line_is_too_short_from_three_standard_deviations_on(deviations: float, status: SolverStatus) -> None:
     """On a base line along x it varies as the two x readings do together."""

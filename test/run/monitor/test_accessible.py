@@ -51,34 +51,19 @@ def shown(serve: Callable[..., Serving]) -> Serving:
     return serving
 
 
-def test_axe_finds_what_is_wrong(page: Page, tmp_path: Path) -> None:
-    bad = tmp_path / 'bad.html'
-    bad.write_text('<!doctype html><html><title>x</title><body><input><p style="color:#aaa">pale</p></body></html>')
-    page.open(bad.as_uri())
-    found = ' '.join(violations(page.driver))
-    for rule in ('color-contrast', 'html-has-lang', 'label', 'landmark-one-main'):
-        assert f'{rule} (' in found
-
-
+@pytest.mark.slow
 def test_the_live_page(page: Page, shown: Serving) -> None:
     page.open(shown.url)
     audit(page, 'document.body.dataset.rows >= 105 && document.querySelectorAll("#entries details").length > 0')
 
 
-def test_the_hours_each_on_a_scale_of_its_own(page: Page, shown: Serving) -> None:
-    page.open(shown.url)
-    page.until('document.body.dataset.rows >= 105')
-    page.js('document.querySelector("[data-span=\'600\']").click()')
-    page.js('document.getElementById("each").click()')
-    # The browser remembers both when it opens the page anew.
-    audit(page, 'document.body.dataset.cells > 0 && document.querySelectorAll("#plot_shift .u-axis").length === 3')
-
-
+@pytest.mark.slow
 def test_the_live_page_when_no_samples_come(page: Page, shown: Serving) -> None:
     page.open(shown.url)
     audit(page, 'document.body.dataset.state === "stale" && document.querySelectorAll("#entries details").length > 0')
 
 
+@pytest.mark.slow
 def test_the_live_page_with_all_that_opens(page: Page, shown: Serving) -> None:
     shown.give(105, 1, status=BlockStatus.LASER_LOST)
     page.open(shown.url)
@@ -92,15 +77,7 @@ def test_the_live_page_with_all_that_opens(page: Page, shown: Serving) -> None:
         page.driver.refresh()
 
 
-def test_a_recording_that_is_played(page: Page, serve: Callable[..., Serving]) -> None:
-    serving = serve()
-    replay = {'kind': 'replay', 'name': 'bags/test', 'recording': None, 'paused': True, 'span': [1.7e9, 1.7e9 + 10]}
-    serving.shown.describe = lambda: replay  # type: ignore[method-assign]
-    serving.give(0, 100)
-    page.open(serving.url)
-    audit(page, 'document.getElementById("state").textContent === "paused"')
-
-
+@pytest.mark.slow
 def test_the_page_of_a_recording(page: Page, tmp_path: Path) -> None:
     out = tmp_path / 'recording.html'
     assert main(['plot', str(BAGS / 'laser_off'), '--out', str(out)]) == 0
@@ -109,6 +86,7 @@ def test_the_page_of_a_recording(page: Page, tmp_path: Path) -> None:
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_the_report_of_discover(page: Page, tmp_path: Path) -> None:
     recording, out = tmp_path / 'run.csv', tmp_path / 'found'
     hidden = ['--effect', 'sensor_rotation,psd=1,angle=0.01']

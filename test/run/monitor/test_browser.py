@@ -8,7 +8,6 @@ import contextlib
 import http.server
 import importlib.util
 import random
-import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -19,11 +18,10 @@ import pytest
 
 pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
 
-from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from psd_deflection.records import AppliedLoad, Mark, ParameterChange, ReferencePose
+from psd_deflection.records import Mark
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
 from .browsing import Page
@@ -93,16 +91,6 @@ COLORED = """(() => {
 """Pixels in the colour of dY."""
 
 
-TINTED = """((plot) => {
-  const canvas = document.querySelector(plot + ' canvas');
-  const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-  let n = 0;
-  for (let i = 3; i < data.length; i += 4) n += Math.abs(data[i] - 0x33) < 3;
-  return n / canvas.width / canvas.height;
-})"""
-"""Share of a plot that one band covers: nothing else on it is as transparent."""
-
-
 STICKING_OUT = """(() => {
   for (const name of ['dx', 'dy', 'theta']) document.getElementById(name).textContent = '\u221212345.67';
   return [...document.querySelectorAll('main > section, .number, .number > *, figure, header > *')];
@@ -147,39 +135,6 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
     assert answer[0] == 403
     assert 'monitor_control' in answer[1]
     assert page.complaints() == [] or all('403' in c for c in page.complaints())
-
-
-def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path: Path) -> None:
-    # Taken as unloaded: dots 0.5 mm off those that the device has at rest. Its loads act along Y.
-    port = str(tmp_path / 'port')
-    start('simulate', '--serve', '--link', port).until('port: ')
-    zeros = {'psd_1.zero': [5e-4, 0.0], 'psd_2.zero': [5e-4, 0.0]}
-    # Neither takes over nor leaves behind a zero that a user of this machine has taken.
-    rig = parameter_file(tmp_path, keep_zero=False, **zeros)
-    program = start('monitor', '--port', port, '--params-file', rig, '--http-port', '0')
-    page.open(address_of(program))
-    page.live()
-    dx = 'Number(document.getElementById("dx").textContent.replace("\\u2212", "-"))'
-    page.until(f'{dx} > 400')
-    notice = 'document.getElementById("notice").textContent'
-    text = ''
-    # While the link rings under the simulated load the zero is rejected: once more then.
-    while not text.startswith('unloaded dots (mm): psd_1 ('):
-        assert text == '' or 'move' in text
-        page.driver.execute_script(f'{notice} = ""')
-        page.driver.find_element(By.ID, 'zero').click()
-        page.until(f'{notice} !== ""')
-        text = page.driver.execute_script(f'return {notice}')
-    page.until(f'Math.abs({dx}) < 20')
-    record = page.driver.find_element(By.ID, 'record')
-    record.click()
-    page.until('document.getElementById("record").getAttribute("aria-pressed") === "true"')
-    record.click()
-    page.until('document.getElementById("record").getAttribute("aria-pressed") === "false"')
-    assert program.end() == 0
-    assert [p.name for p in (tmp_path / 'recordings').glob('psd_*/metadata.yaml')] == ['metadata.yaml']
-    # The browser notes the rejections too.
-    assert [c for c in page.complaints() if '/api/zero' not in c or '409' not in c] == []
 
 
 def test_another_site_cannot_press_the_button_nor_look_on(page: Page, serve: Callable[..., Serving]) -> None:
@@ -227,6 +182,7 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     assert serving.server.token not in str(page.js('location.href'))
 
 
+@pytest.mark.slow
 def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_path: Path) -> None:
     link = str(tmp_path / 'port')
     device = start('simulate', '--serve', '--link', link)
@@ -253,6 +209,7 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     assert [c for c in page.complaints() if '409' not in c] == []
 
 
+@pytest.mark.slow
 def test_the_page_reconnects_to_a_restarted_daemon(page: Page, start: Start) -> None:
     port = str(free_port())
     first = start('monitor', str(BAGS / 'clean'), '--loop', '--http-port', port, '--control')
@@ -272,6 +229,7 @@ def test_the_page_reconnects_to_a_restarted_daemon(page: Page, start: Start) -> 
     assert [c for c in page.complaints() if 'ERR_CONNECTION_REFUSED' not in c] == []
 
 
+@pytest.mark.slow
 def test_a_lost_laser_is_observed(page: Page, start: Start) -> None:
     page.open(address_of(start('monitor', str(BAGS / 'laser_off'), '--loop', '--http-port', '0')))
     page.until('document.getElementById("state").textContent === "laser lost"')
@@ -279,17 +237,6 @@ def test_a_lost_laser_is_observed(page: Page, start: Start) -> None:
     page.until('document.getElementById("dx").textContent === "–"')
     page.live()
     page.until('!document.getElementById("detector_2").classList.contains("low")')
-
-
-def test_the_bands_show_two_standard_deviations(page: Page, serve: Callable[..., Serving]) -> None:
-    # A swing of +-0.573 deg with a standard deviation of 0.0002 or 0.17 deg; dX and dY likewise.
-    for scale, drawn in ((1.0, '< 0.02'), (1000.0, '> 0.1')):
-        serving = serve()
-        serving.give(0, 500, scale=scale)
-        page.open(serving.url)
-        page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200', 'a trace of dY')
-        for plot in ('#plot_shift', '#plot_theta'):
-            page.until(f'{TINTED}("{plot}") {drawn}', f'the bands of {plot}')
 
 
 MOST_BYTES = 150_000
@@ -306,24 +253,7 @@ def test_the_first_load_is_small(page: Page, serve: Callable[..., Serving]) -> N
     assert 20_000 < page.js(FETCHED) < MOST_BYTES
 
 
-SHIFT = 'document.querySelector("#plot_shift canvas").getBoundingClientRect()'
-
-
-def test_a_plot_is_as_large_as_the_window_until_escape(page: Page, serve: Callable[..., Serving]) -> None:
-    serving = serve()
-    serving.give(0, 200)
-    page.open(serving.url)
-    page.until(f'document.body.dataset.rows >= 200 && {COLORED} > 100', 'a trace of dY')
-    small = page.js(f'{SHIFT}.height')
-    page.js('document.querySelector("#plot_shift").parentElement.querySelector(".enlarge").click()')
-    page.until(f'{SHIFT}.height > 0.7 * innerHeight && {SHIFT}.width > 0.9 * innerWidth', 'a large plot')
-    assert page.js('document.getElementById("zero").closest("header").inert')
-    page.until(f'{COLORED} > 100', 'a trace of dY in it')
-    page.js('document.dispatchEvent(new KeyboardEvent("keydown", { key: "Escape" }))')
-    page.until(f'{SHIFT}.height === {small}', 'a plot as before')
-    assert not page.js('document.querySelector("header").inert')
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize('width', [390, 844, 1024, 1440])
 def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serving], width: int) -> None:
     serving = serve(monitor_control=True)
@@ -343,6 +273,7 @@ def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serv
         page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
 
 
+@pytest.mark.slow
 def test_a_moment_is_marked_from_the_page(page: Page, serve: Callable[..., Serving]) -> None:
     serving = serve()
     serving.give(0, 200)
@@ -360,6 +291,7 @@ def test_a_moment_is_marked_from_the_page(page: Page, serve: Callable[..., Servi
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Serving]) -> None:
     serving = serve()
     serving.give(0, 20)
@@ -384,108 +316,7 @@ def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Se
     assert page.complaints() == []
 
 
-def test_a_load_is_noted_from_the_page(page: Page, start: Start) -> None:
-    page.open(address_of(start('monitor', '--http-port', '0')))
-    page.live()
-
-    def note(button: str, **values: str) -> None:
-        page.driver.find_element(By.ID, 'load').click()
-        page.until('document.getElementById("weigh").open')
-        for name, value in values.items():
-            field = page.driver.find_element(By.ID, name)
-            field.clear()
-            field.send_keys(value)
-        page.driver.find_element(By.CSS_SELECTOR, f'#weigh button[value={button}]').click()
-
-    note('set', fx='0', fy='-10', tz='0.5')
-    page.until('document.getElementById("notice").textContent === "load noted: Fx 0 N, Fy -10 N, Tz 0.5 N\u00b7m"')
-    page.until('document.getElementById("tiles").textContent.includes("known load\u221210 N in Y, 0.5 N\u00b7m")')
-    note('add', fx='0', fy='-10', tz='0')
-    page.until('document.getElementById("notice").textContent === "load noted: Fx 0 N, Fy -20 N, Tz 0.5 N\u00b7m"')
-    page.driver.find_element(By.ID, 'load').click()
-    page.until('document.getElementById("held").textContent === "\u221220 N in Y, 0.5 N\u00b7m"')
-    page.driver.find_element(By.ID, 'weigh_cancel').click()
-    page.until('!document.getElementById("weigh").open')
-    assert page.complaints() == []
-
-
-INK = """((plot) => {
-  const canvas = document.querySelector(plot + ' canvas');
-  const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-  let n = 0;
-  for (let i = 3; i < data.length; i += 4) n += data[i] > 200;
-  return n;
-})"""
-"""Pixels of a plot that are drawn on."""
-
-
-def test_traces_show_values_zoom_and_can_be_switched_off(page: Page, serve: Callable[..., Serving]) -> None:
-    serving = serve()
-    serving.give(0, 500)
-    page.open(serving.url)
-    page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200')
-    plot = page.driver.find_element(By.CSS_SELECTOR, '#plot_shift .u-over')
-    wide = plot.size['width']
-    key = 'document.querySelector(\'[data-plot="{}"][data-series="{}"] output\').textContent'
-    shown = key.format('shift', 1)
-    assert page.js(shown) == ''
-    ActionChains(page.driver).move_to_element_with_offset(plot, -wide // 4, 0).perform()
-    page.until(f'{shown} !== ""')
-    # The cursor is on all traces at once; the value is that of the row below it, an amplitude of 1 mm.
-    assert abs(float(page.js(shown).replace('\u2212', '-'))) <= 1000.0
-    # As many decimals as the standard deviations of 0.2 um and 0.17 mdeg have digits.
-    for name in (shown, key.format('theta', 1)):
-        assert re.fullmatch(r'\u2212?[0-9]+\.[0-9]{2}', page.js(name))
-    assert page.js(key.format('sums', 2)) == '5'
-    assert page.js('document.querySelector(\'output.at[data-plot="shift"]\').textContent').count(':') == 2
-    # A stretch that is dragged over fills the plot, and the traces stand still.
-    before = page.js(f'{INK}("#plot_shift")')
-    ActionChains(page.driver).click_and_hold().move_by_offset(wide // 8, 0).release().perform()
-    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "true"')
-    page.until(f'{INK}("#plot_shift") !== {before}')
-    serving.give(500, 10)
-    page.until('document.body.dataset.rows >= 510')
-    ActionChains(page.driver).double_click(plot).perform()
-    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "false"')
-    dy = page.driver.find_element(By.CSS_SELECTOR, '[data-plot="shift"][data-series="4"]')
-    dy.click()
-    page.until(f'{COLORED} === 0', 'no trace of dY')
-    assert dy.get_attribute('aria-pressed') == 'false'
-    # It stays off when the plots are drawn in other colours.
-    scheme = {'features': [{'name': 'prefers-color-scheme', 'value': 'dark'}]}
-    page.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', scheme)
-    try:
-        page.until('getComputedStyle(document.body).backgroundColor === "rgb(14, 20, 26)"')
-        page.until(f'{INK}("#plot_theta") > 1000')
-        assert page.js(COLORED) == 0
-    finally:
-        page.driver.execute_cdp_cmd('Emulation.setEmulatedMedia', {'features': []})
-    dy.click()
-    page.until(f'{COLORED} > 200', 'a trace of dY')
-    # The test reads the canvas, which the page does not.
-    assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
-
-
-def test_loads_zeros_marks_and_references_are_drawn(page: Page, serve: Callable[..., Serving]) -> None:
-    drawn = []
-    for marked in (False, True):
-        serving = serve()
-        if marked:
-            serving.feed.put(AppliedLoad(START_NS + 100 * BLOCK_NS, 0.0, -10.0, 0.0))
-            serving.feed.put(Mark(START_NS + 300 * BLOCK_NS, 'bumped it'))
-            serving.feed.put(ParameterChange(START_NS + 200 * BLOCK_NS, 200, (('psd_1.zero', (0.0, 0.0)),)))
-            for k in range(0, 500, 20):
-                serving.feed.put(ReferencePose(START_NS + k * BLOCK_NS, 0.5e-3, -0.5e-3, 0.005))
-        serving.give(0, 500)
-        page.open(serving.url)
-        page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200')
-        shown = 'document.querySelector(".references").hidden'
-        page.until(f'{shown} === {str(not marked).lower()}')
-        drawn.append([page.js(f'{INK}("{plot}")') for plot in ('#plot_shift', '#plot_theta', '#plot_sums')])
-    # Lines with words, and rings.
-    assert all(after > before + 50 for before, after in zip(*drawn, strict=True))
-
-
+@pytest.mark.slow
 def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
     page.open(address_of(start('monitor', str(BAGS / 'clean'), '--http-port', '0', '--speed', '0.05')))
     page.until('!document.getElementById("seek").disabled')
@@ -548,14 +379,7 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
     assert page.complaints() == []
 
 
-def test_a_label_of_the_time_axis_has_every_decimal_of_its_step(page: Page, serve: Callable[..., Serving]) -> None:
-    page.open(serve().url)
-    digits = page.later(
-        "import('/page/charts.js').then((charts) => [60, 5, 2.5, 1, 0.25, 0.05, 0.002].map(charts.decimals))"
-    )
-    assert digits == [0, 0, 1, 0, 2, 2, 3]
-
-
+@pytest.mark.slow
 def test_a_load_of_the_page_takes_a_decimal_comma_or_rejects(page: Page, serve: Callable[..., Serving]) -> None:
     serving = serve()
     serving.give(0, 20)

@@ -93,33 +93,6 @@ def test_zero_waits_for_a_link_that_moves(
 CALIBRATE = ['calibrate', '--live', '--params-file', str(ROOT / 'config' / 'thesis_rig.yaml'), '--out']
 
 
-def test_calibrate_records_and_ends_with_the_recording(
-    serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag, out = tmp_path / 'bag', tmp_path / 'out'
-    made = simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29), (-40, 40, 20)], seconds=1, seed=4)
-    convert(made, bag, made.parameters, Beside.of(made), made.blocks())
-    serving = serve()
-    serving.shown.folder = str(bag)
-    # It asks whether something is recorded, asks for a recording, and where it is; then somebody ends it.
-    asked, reported = itertools.count(1), client.recording_of
-
-    def recording_of(daemon: client.Daemon) -> str | None:
-        if next(asked) == 3:
-            serving.shown.recordings.append(None)
-        return reported(daemon)
-
-    monkeypatch.setattr(client, 'recording_of', recording_of)
-    monkeypatch.setattr('os.nice', lambda more: more)
-    assert main([*CALIBRATE, str(out)]) == 0
-    assert serving.shown.recordings == [str(bag), None, None]
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f'recording to {bag}; Ctrl-C or `psd-deflection record stop` ends it'
-    assert sum(line.startswith('   4.0 s  ') for line in lines) > 10
-    assert any(line.startswith('next: ') for line in lines)
-    assert {path.name for path in out.iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
-
-
 def test_a_stop_of_the_calibration_is_never_lost(
     serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,23 +242,7 @@ def started(program: str, *words: str) -> subprocess.CompletedProcess[str]:
 HEAVY = ('scipy', 'aiohttp', 'matplotlib', 'ruamel')
 
 
-@pytest.mark.parametrize('command', [['zero'], ['record'], ['load', '0', '0', '0'], ['mark', 'x'], ['echo', '--help']])
-def test_a_client_starts_without_what_it_does_not_need(serve: Serve, command: list[str]) -> None:
-    serving = serve()
-    program = (
-        'import os, sys\nfrom psd_deflection.cli.main import main\n'
-        'try:\n    status = main(sys.argv[1:])\nexcept SystemExit as end:\n    status = end.code\n'
-        f'found = [name for name in {HEAVY!r} if name in sys.modules]\n'
-        'print(status, found, os.times().user + os.times().system)'
-    )
-    url = [] if '--help' in command else ['--url', serving.url]
-    done = started(program, *command, *url)
-    status, found, cpu_s = done.stdout.splitlines()[-1].replace('[]', 'none').split()
-    assert (status, found) == ('0', 'none')
-    # Of a processor that others use too; alone it takes a fifth.
-    assert float(cpu_s) < 1.0
-
-
+@pytest.mark.slow
 def test_a_mark_and_a_load_say_how_long_ago_they_were_typed(serve: Serve) -> None:
     serving = serve()
     # What it imports first stands for a slow start: how long that took, it prints.

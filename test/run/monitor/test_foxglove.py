@@ -225,18 +225,6 @@ def test_which_pages_may_look_is_a_parameter() -> None:
         server.close()
 
 
-def test_one_viewer_too_many_is_sent_away(served: Served) -> None:
-    async def go() -> tuple[object, object]:
-        async with aiohttp.ClientSession() as client:
-            lookers = [await connected(client, served.server.address) for _ in range(VIEWERS)]
-            for one in lookers:
-                await one.receive()
-            late = await (await connected(client, served.server.address)).receive()
-            return late.data, late.extra
-
-    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, f'{VIEWERS} viewers look on already')
-
-
 def deaf(served: Served) -> socket.socket:
     """A viewer that asks for everything and then reads nothing, not even the answer to its pings."""
     one = socket.create_connection(('127.0.0.1', served.port))

@@ -100,6 +100,7 @@ class Plain:
     of = (True, True, True)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(blocks, st.integers(0, 3), st.integers(1, 400), st.integers(10, 200))
 @example([(k, None, 0.0, 0, 0) for k in (1, 50 * SECOND, 145 * SECOND, 87 * SECOND)], 3, 73, 10)
@@ -141,26 +142,6 @@ def test_cells_are_what_the_rows_say(
         assert found.columns['blocks'][k] == len(here)
         assert found.columns['estimates'][k] == len(dxs)
         assert found.columns['lost'][k] == sum(r.spots.lost + SIZE * r.gone for r in here)
-
-
-def test_a_gap_has_no_value_and_loses_nothing() -> None:
-    made = filled(row(START_NS + s * SECOND, 1e-3) for s in (*range(10), *range(70, 80)))
-    found = window(made, 0, 80)
-    assert found.width_ns == SECOND
-    assert np.isnan(found.columns['dx'][10:70]).all()
-    assert np.isfinite(found.columns['dx'][[*range(10), *range(70, 80)]]).all()
-    assert found.columns['blocks'].sum() == 20
-    # In cells wider than the gap it is not seen, but their count of blocks tells it.
-    assert window(made, 0, 80, 1).columns['blocks'].tolist() == [10, 10]
-
-
-def test_a_second_that_is_under_way_is_shown_and_goes_on() -> None:
-    made = filled([row(START_NS, 1e-3)])
-    assert window(made, 0, 1).columns['blocks'].tolist() == [1]
-    made.add(row(START_NS + 1000, 3e-3))
-    found = window(made, 0, 1)
-    assert found.columns['blocks'].tolist() == [2]
-    assert found.columns['dx'][0] == pytest.approx(2e-3)
 
 
 def test_old_times_are_asked_of_the_level_that_still_has_them() -> None:
@@ -213,6 +194,7 @@ def test_memory_is_taken_once_and_marks_are_bounded() -> None:
     assert content['marks_left_out'] == history.MOST_MARKS - history.SENT_MARKS
 
 
+@pytest.mark.slow
 def test_a_week_is_answered_in_the_cells_that_were_asked_for() -> None:
     made = filled(row(START_NS + s * SECOND, 1e-6 * s) for s in range(0, 8 * 86_400, 30))
     for span, points, width in ((7 * 86_400, 2000, 360), (86_400, 1000, 120), (3600, 700, 6), (600, 700, 1)):
@@ -289,12 +271,3 @@ def test_marks_are_to_be_kept_at_first_and_when_there_are_new_ones() -> None:
     assert made.unsaved().marks == [(START_NS, '"bumped"')]
     assert made.unsaved().marks is None
     assert made.unsaved(0).marks == [(START_NS, '"bumped"')]
-
-
-def test_the_newest_two_thousand_marks_are_kept() -> None:
-    made = History(2, SIZE, SMALL)
-    for n in range(2100):
-        made.mark(START_NS + n, f'{n}')
-    marks = made.unsaved().marks
-    assert marks is not None
-    assert [text for _, text in marks] == [f'{n}' for n in range(100, 2100)]

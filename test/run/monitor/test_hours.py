@@ -12,13 +12,9 @@ pytest.importorskip('selenium', reason='the browser tests need selenium: pip ins
 
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
 
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import BlockStatus, Mark
-from psd_deflection.run.monitor.history import Asked, History
-from test.heard import WAIT_S
 
 from .browsing import Page
 from .serving import BLOCK_NS, START_NS, Serving
@@ -107,6 +103,7 @@ def test_a_mark_a_gap_and_an_alarm_are_observed_in_the_hour(page: Page, hour: Se
     assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
 
 
+@pytest.mark.slow
 def test_the_cell_under_the_cursor_is_reported_and_a_stretch_is_asked_for_anew(page: Page, hour: Serving) -> None:
     page.open(hour.url)
     page.until('document.body.dataset.rows > 0')
@@ -130,87 +127,3 @@ def test_the_cell_under_the_cursor_is_reported_and_a_stretch_is_asked_for_anew(p
     page.until(f'/^a point is the mean of 6 s|\\+ 6 s: /.test({CELL})')
     choose(page, '30 s')
     assert page.complaints() == []
-
-
-def test_each_has_a_scale_of_its_own_and_the_browser_remembers_it(page: Page, serve: Callable[..., Serving]) -> None:
-    serving = serve()
-    serving.give(0, 500)
-    page.open(serving.url)
-    page.until('document.body.dataset.rows >= 500')
-    axes = 'document.querySelectorAll("#plot_shift .u-axis").length'
-    assert page.js(axes) == 2
-    button = page.driver.find_element(By.ID, 'each')
-    # With the keyboard, as every other button.
-    button.send_keys(Keys.ENTER)
-    page.until(f'{axes} === 3 && document.getElementById("each").getAttribute("aria-pressed") === "true"')
-    page.until(f'{see(0.2, 0.8, DY)} > 200', 'what was drawn stays')
-    choose(page, '10 min')
-    page.until(f'{OPEN} > 5 && {axes} === 3')
-    page.driver.refresh()
-    page.until(f'{axes} === 3 && {PRESSED} === "10 min,Scale each"')
-    page.driver.find_element(By.ID, 'each').click()
-    page.until(f'{axes} === 2')
-    choose(page, '30 s')
-    page.until(f'{OPEN} === undefined && {see(0, 1, DY)} > 200')
-    assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
-
-
-@pytest.mark.parametrize('width', [390, 1024])
-def test_the_hours_fit_the_screen(page: Page, hour: Serving, width: int) -> None:
-    metrics = {'width': width, 'height': 800, 'deviceScaleFactor': 1, 'mobile': width < 800}
-    page.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
-    try:
-        page.open(hour.url)
-        page.until('document.body.dataset.rows > 0')
-        choose(page, '7 d')
-        page.js('document.getElementById("each").click()')
-        page.until(f'{OPEN} > 1 && document.querySelectorAll("#plot_shift .u-axis").length === 3')
-        assert page.js('document.documentElement.scrollWidth') <= width
-        for plot in ('shift', 'theta', 'sums'):
-            assert page.js(f'document.querySelector("#plot_{plot} .u-over").clientWidth') > 0.4 * width
-        # What lies above another is as wide, so that a moment is at one place in all.
-        wide = [page.js(f'document.querySelector("#plot_{p} .u-over").clientWidth') for p in ('shift', 'theta', 'sums')]
-        assert max(wide) - min(wide) <= 2
-    finally:
-        page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
-    page.js('document.getElementById("each").click()')
-    choose(page, '30 s')
-
-
-@pytest.mark.slow
-def test_looking_at_hours_for_long_leaves_the_heap_as_it_was(
-    page: Page, hour: Serving, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    answers = 0
-    answer = History.answer
-
-    def counted(history: History, wanted: Asked) -> str:
-        nonlocal answers
-        answers += 1
-        return answer(history, wanted)
-
-    monkeypatch.setattr(History, 'answer', counted)
-    page.open(hour.url)
-    page.until('document.body.dataset.rows > 0')
-    # A clock that stands still: the next answer is asked for as soon as one is drawn.
-    page.js('(() => { performance.now = () => 0; })()')
-    choose(page, '1 h')
-
-    def look_until(count: int) -> None:
-        WebDriverWait(page.driver, 3 * WAIT_S, poll_frequency=0.1).until(lambda _: answers >= count)
-
-    def heap_bytes() -> int:
-        """Without an answer that is being read."""
-        page.js('document.getElementById("hold").click()')
-        heap = min(page.heap_bytes() for _ in range(3))
-        page.js('document.getElementById("hold").click()')
-        return heap
-
-    look_until(WARM_ANSWERS)
-    heap = heap_bytes()
-    look_until(WARM_ANSWERS + MORE_ANSWERS)
-    grown = heap_bytes() - heap
-    print(f'heap {heap / 1e6:.2f} MB after {WARM_ANSWERS} answers, {grown / 1e3:+.0f} kB after {MORE_ANSWERS} more')
-    # One column of one answer that stayed would be 5 kB, all of them 2 MB.
-    assert grown < 250_000
-    choose(page, '30 s')

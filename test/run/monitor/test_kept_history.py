@@ -233,17 +233,6 @@ def test_a_file_that_is_damaged_inside_is_put_aside(keep: Callable[[], Keeping],
     assert path.with_name('history.sqlite.damaged').read_bytes() == content
 
 
-def test_marks_are_written_again_only_if_there_are_new_ones() -> None:
-    made = filled([row(START_NS, 0.0)])
-    made.mark(START_NS, '[1]')
-    assert made.unsaved().marks == [(START_NS, '[1]')]
-    assert made.unsaved().marks is None
-    # What could not be kept is kept the next time.
-    assert made.unsaved(0).marks == [(START_NS, '[1]')]
-    made.mark(START_NS + 1, '[2]')
-    assert made.unsaved().marks == [(START_NS, '[1]'), (START_NS + 1, '[2]')]
-
-
 def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Callable[[], Keeping], tmp_path: Path) -> None:
     (tmp_path / 'state').write_text('a file')
     one = keep()

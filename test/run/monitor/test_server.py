@@ -162,24 +162,6 @@ def test_the_buttons_are_off_on_the_network_and_if_they_are_switched_off(
     assert 'token' not in serving.logged[0]
 
 
-def test_on_this_machine_the_buttons_work_and_report_the_result(serve: Serve) -> None:
-    serving = serve()
-    assert ask(serving.url + 'api/zero')[:2] == (200, '{"ok": true, "message": "unloaded dots taken"}')
-    assert serving.shown.zeros == 1
-    assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
-    assert serving.shown.recordings == ['recordings/test']
-    assert ask(serving.url + 'api/record', body={'record': False})[0] == 200
-    assert serving.shown.recordings == ['recordings/test', None]
-    # The run tells what came of it, once; here it is told who wanted it.
-    assert [line for line in serving.logged if 'dots' in line or 'asked for' in line] == [
-        'monitor: zero was asked for by 127.0.0.1',
-        *['monitor: record was asked for by 127.0.0.1'] * 2,
-    ]
-    serving.shown.rejection = 'no good block yet'
-    status, text, _ = ask(serving.url + 'api/zero')
-    assert (status, json.loads(text)) == (409, {'ok': False, 'message': 'no good block yet'})
-
-
 @pytest.mark.parametrize(
     ('headers', 'body', 'status'),
     [
@@ -354,23 +336,6 @@ def test_who_may_not_see_the_page_does_not_get_its_history(
     assert (found, words in text) == (status, True)
 
 
-def test_a_client_that_wants_no_history_gets_new_rows_alone(serve: Serve) -> None:
-    serving = serve()
-    serving.give(0, 5)
-    listen(serving.url, lambda m: 'rows' in m)
-
-    async def go() -> list[Any]:
-        async with aiohttp.ClientSession() as session, session.ws_connect(f'{serving.url}ws?history=0') as socket:
-            await socket.receive()
-            serving.give(5, 1)
-            while 'rows' not in (message := json.loads((await socket.receive()).data)):
-                pass
-            return list(message['rows'])
-
-    rows = asyncio.run(asyncio.wait_for(go(), WAIT_S))
-    assert [row[1] for row in rows] == [5]
-
-
 @pytest.mark.parametrize('headers', [{'Origin': 'http://evil.example'}, {'Host': 'evil.example'}])
 def test_another_site_cannot_listen(serve: Serve, headers: dict[str, str]) -> None:
     serving = serve()
@@ -447,19 +412,6 @@ def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 viewers look on already')
 
 
-def test_a_browser_that_comes_between_two_reports_is_shown_the_last(
-    serve: Serve, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server, 'HEALTH_S', 1e6)
-    serving = serve(monitor_control=True)
-    for _ in range(2):
-        messages = listen(serving.url, lambda m: 'health' in m)
-        assert messages[-1]['health']['entries'][0]['message'] == 'samples flow'
-        assert ask(serving.url + 'api/record', body={'record': True})[0] == 200
-    assert messages[-1]['health']['recording'] == 'recordings/test'
-    assert serving.shown.reports == 1
-
-
 def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve(monitor_control=True, monitor_address='0.0.0.0')
     url = f'http://127.0.0.1:{serving.port}/'
@@ -491,19 +443,3 @@ def test_an_address_of_another_machine_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r"monitor_address = '192\.0\.2\.1'"):
         server.start()
     server.close()
-
-
-def test_browsers_learn_of_the_end_and_close_is_idempotent(serve: Serve) -> None:
-    serving = serve()
-
-    async def go() -> int | None:
-        async with aiohttp.ClientSession() as session, session.ws_connect(serving.url + 'ws') as socket:
-            await socket.receive()
-            closing = asyncio.get_running_loop().run_in_executor(None, serving.server.close)
-            async for _ in socket:
-                pass
-            await closing
-            return socket.close_code
-
-    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 1001
-    serving.server.close()

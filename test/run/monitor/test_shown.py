@@ -188,11 +188,3 @@ def test_what_cannot_be_is_one_line(
     err = capsys.readouterr().err
     assert reported in err
     assert err.strip().count('\n') == 0
-
-
-def test_without_aiohttp_the_error_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr('psd_deflection.run.monitor.served.importlib.util.find_spec', lambda name: None)
-    assert main(['monitor']) == 3
-    assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from psd_deflection import __version__
-from psd_deflection.base.charts import Chart
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.model.misalignment.model import ALL, INDEX, readings
 from psd_deflection.model.misalignment.rig import vector_of_rig
@@ -289,21 +288,6 @@ def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> No
     assert _certified(certificate).verdicts == []
 
 
-def test_the_sentences_say_the_largest(certificate: Certificate) -> None:
-    first, second = _certified(certificate).sentences()
-    largest = [max(s.uncertainty[i] for s in certificate.stated) * SCALES[i] for i in range(3)]
-    assert f'the largest of 3 poses: ΔX {largest[0]:.3g} µm, ΔY {largest[1]:.3g} µm, θ {largest[2]:.3g} mdeg.' in first
-    wrong = [max(abs(e[i]) for e in certificate.found) * SCALES[i] for i in range(3)]
-    assert f'wrong by up to ΔX {wrong[0]:.3g} µm, ΔY {wrong[1]:.3g} µm, θ {wrong[2]:.3g} mdeg.' in second
-    wide = _certified(certificate, limits=(1.0, 1.0, 1.0))
-    assert wide.sentences()[2] == 'As found: every pose conforms; as left: every pose conforms.'
-    lines = wide.lines()
-    assert lines[:4] == [*wide.sentences(), '']
-    # The number, ΔX, ΔY and θ of the pose stand flush left.
-    assert [line.split()[0] for line in lines[6:]] == ['1', '2', '3']
-    assert lines[6].startswith(f'1     {POSES[0][0] * 1e6:.3f}')
-
-
 def test_mixed_verdicts_are_all_named(certificate: Certificate) -> None:
     # One pose was a metre off, the others not at all.
     wrong = replace(certificate, found=np.diag([1.0, 0.0, 0.0]))
@@ -311,21 +295,6 @@ def test_mixed_verdicts_are_all_named(certificate: Certificate) -> None:
     assert message == 'As found: conforms, does not conform; as left: every pose conforms.'
     message = _certified(certificate, limits=(1e-12, 1.0, 1.0)).sentences()[2]
     assert message.endswith('as left: every pose not decided.')
-
-
-def test_the_chart_has_every_error_and_both_limits(certificate: Certificate) -> None:
-    chart = _certified(certificate, limits=LIMITS).chart()
-    assert chart.beside == 3
-    for i, (panel, axis) in enumerate(zip(chart.panels, ('ΔX / µm', 'ΔY / µm', 'θ / mdeg'), strict=True)):
-        (curve,) = panel.series
-        assert panel.y_label == axis
-        assert curve.x.tolist() == [1.0, 2.0, 3.0]
-        assert curve.y == pytest.approx(SCALES[i] * certificate.found[:, i])
-        assert curve.half_width == pytest.approx([SCALES[i] * message.uncertainty[i] for message in certificate.stated])
-        assert [rule.at for rule in panel.rules] == pytest.approx([-SCALES[i] * LIMITS[i], SCALES[i] * LIMITS[i]])
-        assert all(rule.across for rule in panel.rules)
-    assert all(not panel.rules for panel in _certified(certificate).chart().panels)
-    assert sum(isinstance(one, Chart) for one in _certified(certificate).drawings()) == 1
 
 
 def test_the_files_have_all_digits(certificate: Certificate) -> None:
@@ -381,17 +350,6 @@ def test_the_tree_and_the_table_have_the_same_numbers(certificate: Certificate) 
     plain = _certified(certificate).tree()
     assert plain['limits'] is None
     assert [one['conformity'] for one in plain['poses']] == [None] * 3
-
-
-def test_sources_are_numbered(certificate: Certificate) -> None:
-    assert _certified(certificate).sources == {
-        'version': __version__,
-        'calibrated rig file': 'new/rig.yaml',
-        'calibrated on': '2026-01-02',
-        'recording 1': 'a.csv (sha256 aa)',
-        'recording 2': 'b.csv (sha256 bb)',
-        'recording 3': 'c.csv (sha256 cc)',
-    }
 
 
 def test_the_page_has_every_section(certificate: Certificate) -> None:

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.model.detector.clipping import cut_by_edges
-from psd_deflection.model.plate.plate import plate_points, tied_pose
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.budget.chain import MeasuringChain, dots, measure
 from psd_deflection.studies.budget.estimate import estimator_of
@@ -62,46 +60,6 @@ def test_everything_wrong_at_once() -> None:
     readings, zeros = measure(chain, _pose('G12'))
     assert zeros[0] == pytest.approx(np.array(case['m0']), rel=1e-12)
     assert np.max(np.abs(readings[0] - got)) == pytest.approx(slope[0] * case['pose'][2], rel=0.05)
-
-
-def test_the_chain_and_the_model_of_the_estimators_agree() -> None:
-    chain = replace(
-        MeasuringChain.of(RIG), heights=np.array([0.05, -0.02]), zeros=np.array([[7e-5, -5e-5], [-3e-5, 4e-5]])
-    )
-    pose = np.array([0.001, -0.002, 0.017])
-    points = plate_points(tied_pose(pose, 1.5, 0.585), chain.centers + chain.zeros, chain.heights)
-    assert dots(chain, pose)[0] == pytest.approx(points - chain.centers, abs=1e-15)
-
-
-def test_a_clipped_spot_reads_the_centroid_of_what_is_caught() -> None:
-    half, diameter, place = np.array([5e-3, 5e-3]), 2e-3, np.array([4.6e-3, -1.0e-3])
-    _, moved = cut_by_edges(place, half, diameter / 2.0)
-    got = place + moved
-    # By brute force: intensity of 1/e^2 diameter D on a fine grid over the active area.
-    edges = np.linspace(-5e-3, 5e-3, 20_001)
-    axis = (edges[1:] + edges[:-1]) / 2.0
-    for k in range(2):
-        light = np.exp(-8.0 * (axis - place[k]) ** 2 / diameter**2)
-        assert got[k] == pytest.approx(float(np.sum(axis * light) / np.sum(light)), abs=2e-9)
-    assert got[0] < place[0] - 1e-4
-    point = replace(MeasuringChain.of(RIG), spot_diameter=np.zeros((1, 1)))
-    readings, _ = measure(point, np.zeros(3))
-    assert readings[0] == pytest.approx(RIG.zeros, abs=1e-15)
-
-
-@pytest.mark.parametrize('method', ['exact', 'beam', 'wls', 'thesis_iteration'])
-def test_responses_agree_with_differences(method: str) -> None:
-    rig = replace_values(RIG, {'psd_1.height': 0.03, 'psd_2.zero': [1e-4, -2e-4]})
-    estimator = estimator_of(rig, method)
-    pose = np.array([0.0003, -0.0022, -0.0164])
-    chain = replace(MeasuringChain.of(rig), slope_ratio=np.array([estimator.slope_ratio]))
-    readings, zeros = measure(chain, pose)
-    by_readings, by_zeros = estimator.response(pose, chain.zeros)
-    step = 1e-7 * np.eye(4).reshape(4, 2, 2)
-    for got, first, second in ((by_readings, step, 0.0 * step), (by_zeros, 0.0 * step, step)):
-        up = estimator.estimate(readings + first, zeros + second)
-        down = estimator.estimate(readings - first, zeros - second)
-        assert got == pytest.approx((up - down).T / 2e-7, rel=1e-5, abs=1e-6)
 
 
 @pytest.mark.parametrize(('method', 'key'), [('exact', 'procrustes'), ('beam', 'beam_gn_k1.5'), ('wls', 'ols')])

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,15 +14,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import readings
 from psd_deflection.model.misalignment.rig import vector_of_rig
-from psd_deflection.model.plate.linear import design_matrix, gain_matrix
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.budget.chain import MeasuringChain, dots, measure
-from psd_deflection.studies.budget.computation import COMPUTATION, perfect_answer, stop_window
-from psd_deflection.studies.budget.estimate import ExactEstimator, LinearEstimator, estimator_of
+from psd_deflection.studies.budget.computation import COMPUTATION, perfect_answer
+from psd_deflection.studies.budget.estimate import ExactEstimator, estimator_of
 from psd_deflection.studies.budget.evaluate import CAUSES, draws, monte_carlo
 from psd_deflection.studies.budget.inputs import read_inputs
 from psd_deflection.studies.budget.installation import BRACKET_EXPANSION, PLANE_TILT, SLOPE_RATIO
@@ -175,17 +173,6 @@ def test_what_the_other_terms_change() -> None:
 # ---- The chain ----
 
 
-def test_a_nominal_chain_has_no_error() -> None:
-    chain = MeasuringChain.of(RIG)
-    shapes = {f.name: getattr(chain, f.name).shape for f in fields(MeasuringChain)[6:]}
-    of_both = ('height_error', 'rotation', 'spot_diameter', 'nonlinearity', 'background')
-    assert shapes == {name: (1, 1) if name in of_both else (1, 1, 2) for name in shapes}
-    assert not any(getattr(chain, name).any() for name in shapes)
-    assert chain.half_area.tolist() == [[0.005, 0.006], [0.004, 0.007]]
-    assert _at().area == pytest.approx(np.array([[0.010, 0.012], [0.008, 0.014]]))
-    assert (chain.link_length, chain.slope_ratio.tolist()) == (0.7, [1.5])
-
-
 def _traced(chain: MeasuringChain, pose: FloatArray, dz: float, psd: int) -> FloatArray:
     """The dot (2,) of one sensor: a ray and a plane in space, with the rotations of scipy."""
     k = chain.slope_ratio[0] / chain.link_length
@@ -278,36 +265,6 @@ def test_weighted_least_squares_is_that_of_scipy(method: str) -> None:
             assert pose == pytest.approx(best.x, abs=1e-8)
 
 
-def test_a_weighted_response_is_that_of_the_estimate() -> None:
-    base = estimator_of(RIG, 'beam')
-    assert isinstance(base, ExactEstimator)
-    estimator = replace(base, weights=np.array([1.0, 4.0, 0.25, 9.0]))
-    pose = np.array([1e-3, -2e-3, 0.02])
-    read, zeros = measure(MeasuringChain.of(RIG), pose)
-    assert estimator.estimate(read, zeros)[0] == pytest.approx(pose, abs=1e-13)
-    by_readings, by_zeros = estimator.response(pose, RIG.zeros)
-    step = 1e-7 * np.eye(4).reshape(4, 2, 2)
-    for got, first, second in ((by_readings, step, 0.0 * step), (by_zeros, 0.0 * step, step)):
-        up = estimator.estimate(read + first, zeros + second)
-        down = estimator.estimate(read - first, zeros - second)
-        assert got == pytest.approx((up - down).T / 2e-7, rel=1e-5, abs=1e-6)
-
-
-def test_the_linear_method_is_its_matrix() -> None:
-    thesis = {'wls.weights': 'thesis', 'wls.row_scaling': [0.03, 0.5, 10.0, 0.1]}
-    for rig, scaling in ((RIG, None), (replace_values(RIG, thesis), np.array([0.03, 0.5, 10.0, 0.1]))):
-        found = estimator_of(rig, 'wls')
-        assert isinstance(found, LinearEstimator)
-        gain = gain_matrix(design_matrix(rig.centers + rig.zeros), scaling)
-        assert found.gain == pytest.approx(gain, rel=1e-12)
-        by_readings, by_zeros = found.response(np.zeros(3), rig.zeros)
-        assert by_readings == pytest.approx(gain, rel=1e-12)
-        assert by_zeros == pytest.approx(-gain, rel=1e-12)
-        read = np.array([[[1e-3, 2e-3], [3e-3, 4e-3]]])
-        expected = gain @ (read[0] - rig.zeros).ravel()
-        assert found.estimate(read, rig.zeros[None])[0] == pytest.approx(expected, rel=1e-12)
-
-
 # ---- The situation ----
 
 
@@ -326,16 +283,6 @@ def test_a_dot_outside_is_named(pose: tuple[float, float, float], words: str) ->
     with pytest.raises(ConfigError) as error:
         Situation.at_pose(flat, read_inputs(), np.array(pose), 'exact', ('here', 'less'))
     assert str(error.value) == f'here: {words}'
-
-
-def test_second_order_is_that_of_squares_and_products() -> None:
-    """A tilt of a foreshortens by a^2/2 either way: dense draws have its bias and its variance."""
-    at = _at()
-    cause = _term('sensor_tilt')
-    line = cause.contribution(at)
-    sampled = monte_carlo(at, 60_000, 2, [cause])
-    assert line.bias == pytest.approx(sampled.bias, abs=5.0 * float(np.sqrt(np.diag(sampled.covariance)).max()) / 245.0)
-    assert np.sqrt(np.diag(line.covariance)) == pytest.approx(np.sqrt(np.diag(sampled.covariance)), rel=0.02)
 
 
 def test_any_guess_makes_a_deviation_a_guess() -> None:
@@ -363,25 +310,6 @@ def test_draws_are_of_all_causes_together() -> None:
 
 
 # ---- The stop rule ----
-
-
-def test_the_stop_rule_by_hand() -> None:
-    at = _at('thesis_iteration', iteration_tolerance=2e-4, iteration_step=1e-4)
-    beams = np.array([[0.0101, 0.0798], [-0.1097, 0.0205]])
-    # The longer side of the base line: 0.1198 m along x.
-    window = 2e-4 / 0.1198
-    assert stop_window(beams, 2e-4) == pytest.approx(window, rel=1e-12)
-    line = COMPUTATION.contribution(at)
-    dx, dy, theta = LinkStatics.from_rig(RIG).deflection(*LOAD)
-    assert theta < -window
-    # It comes from 0 and stops half a step inside the window on average: the angle is nearer to 0 than the true one.
-    away = window - 0.5e-4
-    swing = np.array([0.0798 - dy, -(0.0101 - dx), 1.0])
-    assert line.bias == pytest.approx(away * swing, rel=1e-9)
-    assert line.covariance == pytest.approx(np.outer(swing, swing) * 1e-8 / 12.0, rel=1e-9)
-    other = COMPUTATION.contribution(replace(at, pose=np.array([dx, dy, -theta])))
-    assert other.bias == pytest.approx(-away * swing, rel=1e-9)
-    assert estimator_of(RIG, 'thesis_iteration').slope_ratio == 0.0
 
 
 def test_a_window_must_hold_half_a_step() -> None:

@@ -51,17 +51,6 @@ def test_a_bias_that_is_not_corrected_is_added_with_its_size() -> None:
     assert message.uncertainty == pytest.approx([2.093 * 5.0, 2.0 + 1.96 * 2.0, 3.0 + 1.96], abs=2e-3)
 
 
-def test_the_sensitivity_to_a_shift_of_one_reading() -> None:
-    """The gain of least squares on two points, by hand: a shift of x1 moves the pose by the first column of it."""
-    rows = next(c for c in CAUSES if c.name == 'amplifier_noise').sensitivities(_at())
-    assert [s.name for s in rows] == ['x1', 'y1', 'x2', 'y2']
-    pose = _at().pose
-    # A common shift of x of both dots is a shift of the plate by as much the other way, turned by theta.
-    both = rows[0].coefficient + rows[2].coefficient
-    assert both[:2] == pytest.approx([-math.cos(pose[2]), -math.sin(pose[2])], abs=1e-6)
-    assert both[2] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_draws_have_the_declared_distributions() -> None:
     """One cause alone, along one axis: the fourth moment over the squared variance tells the shape."""
     at = _at()

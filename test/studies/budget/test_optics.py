@@ -45,13 +45,6 @@ def test_standard_air_agrees_with_another_authors_formula() -> None:
     assert air_index(101_325.0, 288.15, 0.0) == pytest.approx(1.00027653, abs=5e-9)
 
 
-def test_what_averaging_leaves_of_hum() -> None:
-    assert averaging_gain(20, 50.0, 1000.0) == pytest.approx(0.0, abs=1e-12)
-    assert averaging_gain(20, 60.0, 1000.0) == pytest.approx(0.157, abs=1e-3)
-    # An alias of a constant is not averaged at all.
-    assert averaging_gain(20, 1000.0, 1000.0) == 1.0
-
-
 def _magnus(celsius: float) -> float:
     """WMO-No. 8, annex 4.B: ln e = ln 6.112 + 17.62 t / (243.12 + t), hPa."""
     return 100.0 * math.exp(math.log(6.112) + 17.62 * celsius / (243.12 + celsius))

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.model.link import LinkStatics
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.budget.budget import BudgetProblem, budget
 from psd_deflection.studies.budget.evaluate import CAUSES, draws, monte_carlo
@@ -20,10 +19,7 @@ from psd_deflection.studies.budget.expanded import Interval, difference, expande
 from psd_deflection.studies.budget.inputs import read_inputs
 from psd_deflection.studies.budget.result import (
     Budgeted,
-    display_values,
-    freedom_words,
     in_words,
-    parameter_rows,
     type_of,
 )
 from psd_deflection.studies.budget.term import Contribution, Kind
@@ -60,33 +56,6 @@ def test_the_problem_says_what_is_computed(answer: Budgeted, plain: Budgeted) ->
     assert sizes == [10_000, 3, 10_000, 3]
 
 
-def test_the_situation_is_the_load_and_the_pose(plain: Budgeted) -> None:
-    dx, dy, theta = LinkStatics.from_rig(RIG).deflection(*LOAD)
-    expected = (
-        f'Load (8 N, -30 N, -12 N m): ΔX {1e3 * dx:.4f} mm, ΔY {1e3 * dy:.4f} mm, '
-        f'θ {180.0 / math.pi * theta:.4f} deg; method exact; mean of 20 samples'
-    )
-    assert plain.lines()[:2] == [expected, '']
-    assert f'<p class=quiet>{expected}</p>' in plain.report()
-
-
-def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
-    head, *rows = plain.cause_rows()
-    assert head[5:] == ['ΔX µm', 'ΔY µm', 'θ mdeg', 'ΔX %', 'ΔY %', 'θ %']
-    full = plain.budget.total().rms
-    for row, (cause, line) in zip(rows, plain.budget.lines, strict=True):
-        assert row[:4] == [cause.name, cause.row or '-', cause.kind.value, type_of(cause)]
-        freedom = cause.freedom(plain.budget.at)
-        assert row[4] == ('∞' if freedom == math.inf else str(int(freedom)))
-        size = np.sqrt(line.bias**2 + np.diag(line.covariance))
-        assert [float(v) for v in row[5:8]] == pytest.approx((size * SCALES).tolist(), abs=6e-4)
-        assert [float(v) for v in row[8:]] == pytest.approx((100.0 * (size / full) ** 2).tolist(), abs=0.06)
-    # A line of dashes below the head, four columns flush left.
-    text = plain.lines()
-    assert text[2].split() == ' '.join(head).split()
-    assert text[4].startswith(f'{rows[0][0]:<{max(len(row[0]) for row in (head, *rows))}}  ')
-
-
 def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain: Budgeted) -> None:
     variances = np.array([np.diag(line.covariance) for _, line in plain.budget.lines])
     bias = np.sum([line.bias for _, line in plain.budget.lines], axis=0)
@@ -118,35 +87,6 @@ def test_without_a_spread_there_is_no_difference() -> None:
     assert difference(message, Interval(np.array([1.959964] * 3), np.zeros(3)))[:2] == pytest.approx(
         [1.0, 1.0], abs=1e-6
     )
-
-
-def test_the_sentences_name_the_largest_cause(answer: Budgeted, plain: Budgeted) -> None:
-    first, second, third = plain.sentences()
-    assert first == f'A single estimate is wrong by {in_words(plain.budget.total().rms)} (rms), method exact.'
-    shares = {cause.name: max(plain.budget.shares(line)) for cause, line in plain.budget.lines}
-    largest = max(shares, key=lambda name: float(shares[name]))
-    assert second == f'The largest cause is {largest}: up to {shares[largest]:.0%} of the mean square of an axis.'
-    assert third == f'Expanded uncertainty for 95 %: {in_words(plain.budget.expanded().uncertainty)}.'
-    assert answer.sampled is not None
-    size = np.sqrt(answer.sampled.bias**2 + np.diag(answer.sampled.covariance))
-    assert f'400 random draws of all causes at once give {in_words(size)}.' in answer.sentences()
-    dx, dy, theta = display_values(size)
-    assert f'total     ΔX {dx} µm  ΔY {dy} µm  θ {theta} mdeg' in answer.lines()
-    assert 'Monte Carlo, 400 draws of everything at once (seed 3):' in answer.lines()
-
-
-def test_the_rows_of_the_parameters_are_what_a_sum_by_hand_needs(plain: Budgeted) -> None:
-    head, *rows = parameter_rows(plain.budget)
-    assert head[7:] == ['c ΔX', 'c ΔY', 'c θ', 'ΔX µm', 'ΔY µm', 'θ mdeg']
-    own = [(cause, s) for cause in CAUSES for s in cause.sensitivities(plain.budget.at)]
-    for row, (cause, s) in zip(rows, own, strict=True):
-        assert row[:4] == [cause.name, s.name, type_of(cause), cause.distribution.value]
-        assert float(row[4]) == pytest.approx(s.deviation, rel=1e-5)
-        assert row[5] == cause.unit
-        assert row[6] == freedom_words(cause.freedom(plain.budget.at))
-        assert [float(v) for v in row[7:10]] == pytest.approx(s.coefficient.tolist(), rel=1e-5, abs=1e-12)
-        by_hand = (np.abs(s.coefficient) * s.deviation * SCALES).tolist()
-        assert [float(v) for v in row[10:]] == pytest.approx(by_hand, abs=6e-4)
 
 
 def _same(tree: dict[str, Any], line: Contribution) -> None:

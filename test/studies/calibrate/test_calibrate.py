@@ -19,7 +19,7 @@ from psd_deflection.studies.calibrate import calibrate as module
 from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
 from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, prior_of_rig
-from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, smoothed
+from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows
 from psd_deflection.studies.calibrate.result import values_of
 
 AT = {name: i for i, name in enumerate(NAMES)}
@@ -110,18 +110,6 @@ def test_frames_count_as_much_as_they_say(nominal: Rig, pose: FloatArray) -> Non
     clock = AT['reference.clock']
     assert known.sd[clock] < guessed.sd[clock] / 1.4
     assert abs(known.clock + known.values[clock]) < 4.0 * known.sd[clock]
-
-
-def test_a_reference_may_be_a_mean_over_an_exposure(nominal: Rig) -> None:
-    """The mean of a motion of 14 Hz over 12 ms is 4.5 % less than its middle."""
-    t = np.arange(2000) / 1000.0
-    wave = np.column_stack([np.sin(2 * np.pi * 14.0 * t + phase) for phase in range(4)])
-    at = np.linspace(100.3, 1900.8, 50)
-    less = np.sin(np.pi * 14.0 * 0.012) / (np.pi * 14.0 * 0.012)
-    true = np.column_stack([np.sin(2 * np.pi * 14.0 * at / 1000.0 + phase) for phase in range(4)])
-    assert smoothed(wave, 1e-3, at).dots == pytest.approx(true, abs=3e-5)
-    assert smoothed(wave, 1e-3, at, 0.012).dots == pytest.approx(less * true, abs=3e-5)
-    assert less < 0.956
 
 
 def test_the_beam_solver_takes_a_calibrated_file(nominal: Rig, pose: FloatArray) -> None:
@@ -222,16 +210,6 @@ def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     assert found.groups[0].group == 'psd_1.rotation'
     value, sd = found.groups[0].shifts['psd_1.rotation']
     assert abs(value - 0.03) < 4.0 * sd
-
-
-@pytest.mark.slow
-def test_a_short_campaign_covers_the_truth() -> None:
-    """`make campaign NAME=blind-calibration` in its shortest form: wide bounds, for it is one rig, and it is moved."""
-    found = campaign.summary([campaign.score(1)])
-    assert found.parameters > 0.7
-    assert found.poses > 0.5
-    assert found.worse == 0
-    assert found.named == 1.0
 
 
 def test_what_the_rows_contradict_is_widened_once_each_the_worst_first(

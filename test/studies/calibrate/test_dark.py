@@ -8,26 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import t as student
 
 from blind import calibration as campaign
 from blind import misaligned
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.model.detector import VoltsToDots
-from psd_deflection.model.misalignment.model import COUNT, INDEX, ZERO, by_parameters, readings
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import (
-    PIECES,
-    DarkLevel,
     dark_levels,
-    mean_and_drift,
     result_of_levels,
     values_of_levels,
     words_of_level,
 )
-from psd_deflection.studies.calibrate.fit import fewer
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 
 RATE = 1000
@@ -182,21 +176,6 @@ def test_light_is_not_taken_off_twice(nominal: Rig) -> None:
     dark_levels(runs, replace_values(old, {'psd_1.dark': [0.0, 0.0, 0.1], 'psd_2.dark': [0.0, 0.0, 0.1]}))
 
 
-def test_a_recording_with_lasers_on_does_not_report_light_from_gains() -> None:
-    """What a level does to the readings is what both gains and the zero of that PSD do: no motion tells them apart."""
-    p = np.zeros(COUNT)
-    p[INDEX['psd_1.center_y']], p[INDEX['psd_2.center_x']], p[INDEX['link.slope_ratio']] = 0.07, -0.1, 1.5
-    pose = np.random.default_rng(3).uniform(-1.0, 1.0, (3, 200)) * np.array([[4e-3], [4e-3], [0.03]])
-    read = readings(p, pose, 0.585)
-    # d/db of (S r + b c)/(S + b) at b = 0.
-    by_level = (np.array([1.5e-3, -1.0e-3])[:, None] - read[:2]) / 5.0
-    names = ('psd_1.gain_x', 'psd_1.gain_y')
-    at = [*(INDEX[name] for name in names), ZERO, ZERO + 1]
-    slopes = by_parameters(p, pose, 0.585)[:2, at].transpose(0, 2, 1).reshape(-1, 4)
-    residual = by_level.ravel() - slopes @ np.linalg.lstsq(slopes, by_level.ravel(), rcond=None)[0]
-    assert np.abs(residual).max() < 0.01 * np.abs(by_level).max()
-
-
 def lit_poses(rig: Rig, light: Any, seed: int) -> float:
     """Largest error of ΔX and ΔY, m, of the nominal rig in that light, zeroed in it."""
     rng = np.random.default_rng(seed)
@@ -207,6 +186,7 @@ def lit_poses(rig: Rig, light: Any, seed: int) -> float:
     return float(np.abs(estimate - ((9.0 * (b + c) - a - d) / 16.0)[block])[:, :2].max())
 
 
+@pytest.mark.slow
 def test_estimates_are_free_of_light_and_of_offsets(nominal: Rig) -> None:
     """2 % of the light moves the estimate by 2 % of the deflection; with dark levels half of its noise band is left.
 
@@ -228,21 +208,3 @@ def test_a_calibration_in_the_light_of_a_room_covers_in_another() -> None:
     assert total.worse == 0
     assert total.poses > 0.8
     assert max(float(s.after[:2].max()) for s in scores) < 3e-6
-
-
-def test_a_level_is_a_record(nominal: Rig) -> None:
-    (one, two) = dark_levels([run_of(darkness())], nominal)
-    assert isinstance(one, DarkLevel)
-    rig = replace_values(nominal, values_of_levels([one, two]))
-    assert rig.psds[0].dark == pytest.approx((3.0, -2.0, 0.12), abs=1e-3)
-    assert rig.psds[1].dark == pytest.approx((-1.0, 0.5, 0.06), abs=1e-3)
-
-
-def test_few_pieces_widen_the_interval_to_that_of_student() -> None:
-    part = np.random.default_rng(6).normal(0.0, 2e-3, (4000, 3))
-    mean, sd, _, _ = mean_and_drift(part, 1e-9)
-    pieces = np.array([piece.mean(axis=0) for piece in np.array_split(part, PIECES)])
-    plain = pieces.std(axis=0, ddof=1) / PIECES**0.5
-    worth = [fewer((pieces[:, [i]] - pieces[:, i].mean()), np.zeros(PIECES, dtype=np.int64)) ** 0.5 for i in range(3)]
-    assert mean == pytest.approx(part.mean(axis=0))
-    assert sd == pytest.approx(plain * worth * student.ppf(0.975, PIECES - 1) / 1.959964, rel=1e-6)

@@ -109,14 +109,6 @@ def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
     assert not at_rest(None, t).any()
 
 
-def test_the_first_load_is_held_from_the_first_sample() -> None:
-    # 1024 steps of 1/1024 s are a second, without a rounding; its second half begins with step 512.
-    t = seconds(2100, 1.0 / 1024.0)
-    loads = np.zeros((2100, 3))
-    loads[1025:, 1] = -10.0
-    assert np.flatnonzero(at_rest(loads, t)[:1025]).tolist() == list(range(512, 1025))
-
-
 def test_rows_without_a_reference_are_one_a_block_and_know_what_a_sample_knows() -> None:
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     loads = np.tile([0.0, -5.0, 1.0], (2000, 1))

@@ -12,7 +12,7 @@ import pytest
 import psd_deflection
 from psd_deflection.studies.calibrate.calibrate import OPEN, ROTATED
 from psd_deflection.studies.calibrate.fit import REPORTED
-from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress, progress_of
+from psd_deflection.studies.calibrate.progress import CalibrationProgress, ParameterProgress, progress_of
 from psd_deflection.studies.calibrate.result import result
 from tools.program import ROOT
 
@@ -23,6 +23,7 @@ def calibrated(*loads: tuple[float, float, float]) -> CalibrationProgress:
     return progress_of(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found)
 
 
+@pytest.mark.slow
 def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
     along_x, all_round = calibrated((40, 0, 0)), calibrated((40, 0, 0), (0, -50, -29), (-40, 40, 20))
     assert len(along_x.parameters) == len(REPORTED)
@@ -49,21 +50,6 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
 def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(left: float, determined: bool, filled: float) -> None:
     parameter = ParameterProgress(name='n', words='', value='', left=left, determined=determined)
     assert parameter.filled == pytest.approx(filled)
-
-
-def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
-    parameter = ParameterProgress(name='n', words='a', value='b', left=0.1, determined=True)
-    made = CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short')
-    assert made.tree() == {
-        'kind': 'reference',
-        'seconds': 2.0,
-        'determined': 1,
-        'parameters': [
-            {'name': 'n', 'words': 'a', 'value': 'b', 'left': 0.1, 'determined': True, 'filled': pytest.approx(0.5)}
-        ],
-        'needs': [{'motion': 'push', 'names': ('n',)}],
-        'rejected': 'too short',
-    }
 
 
 def test_a_rejection_is_in_the_file_and_none_is_null() -> None:

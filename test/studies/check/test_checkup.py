@@ -14,11 +14,10 @@ import pytest
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check import checkup
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.levels import Levels
-from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, SIGNIFICANT_DRIFT, WRONG, Checkup
-from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
+from psd_deflection.studies.check.wirings import PushResponse, on_channels
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 
 RIG = load_rig()
@@ -123,26 +122,6 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     assert one.findings[0].equivalent == (f'{others} other wirings, which these pushes cannot tell apart',)
 
 
-@pytest.mark.parametrize(('count', 'words'), [(2, '1 other wiring,'), (3, '2 other wirings,'), (4, '3 other wirings,')])
-def test_other_wirings_are_counted(count: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    some = [WiringFit(wiring, 0.0) for wiring in WIRINGS[7 : 7 + count]]
-    monkeypatch.setattr(checkup, 'fitting_wirings', lambda observed: some)
-    assert {f.equivalent[-1] for f in checked().findings if f.equivalent} == {
-        f'{words} which these pushes cannot tell apart'
-    }
-
-
-def test_a_wiring_that_leaves_some_of_each_push_is_no_other_explanation() -> None:
-    # A push along (c, s) leaves 1 - (c^2 - s^2)^2 with its y turned: 0.3 of one, 0.6 of two, more than of the best.
-    c = math.sqrt(0.5 + 0.5 * math.sqrt(0.7))
-    s = math.sqrt(1.0 - c * c)
-    one = replace(push('fx'), channels=np.array([c, -s, 0.0, 0.0]) * 1e-4, expected=np.array([c, s, 0.0, 0.0]) * 1e-4)
-    found = checked([one, one])
-    assert ('channel_sign', 'y1') in of(found)
-    assert not any('load_sign' in text for f in found.findings for text in f.equivalent)
-    assert next(f.evidence for f in found.findings if f.where == 'y1') == pytest.approx(0.6)
-
-
 def test_all_signs_turned_may_be_the_loads_as_well() -> None:
     wiring = Wiring(False, (('-x', '-y'), ('-x', '-y')))
     found = checked([push(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')])
@@ -195,20 +174,6 @@ def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
     assert found.notes == ((words,) if reported else ())
     # By hand nobody knows how far.
     assert checked([push('fx'), push('fy'), push('tz', size, sized=False)]).notes == ()
-
-
-def test_a_unit_is_reported_by_the_sizes_of_pushes_that_have_one() -> None:
-    kilograms = [push('fx', 9.80665), push('fy', 9.80665), push('tz')]
-    found = checked(kilograms)
-    assert [(f.name, f.where, f.value) for f in found.findings] == [('load_unit', 'fx fy', 9.80665)]
-    by_hand = [replace(p, sized=False) for p in kilograms]
-    assert checked(by_hand).findings == ()
-    only_y = checked([push('fx', sized=False), push('fy', 9.80665), push('tz')])
-    assert of(only_y) == [('load_unit', 'fy')]
-    together = replace(push('fy'), loads=('fy', 'tz'), channels=9.80665 * push('fy').channels)
-    assert ('load_unit', 'fy') in of(checked([push('fx', 9.80665), together]))[:1] or of(
-        checked([push('fx', 9.80665), together])
-    ) == [('load_unit', 'fx fy'), ('load_unit', 'tz'), ('load_coverage', 'fy tz')]
 
 
 # ---- what is needed
@@ -313,40 +278,3 @@ def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, rep
     found = checked(levels=of_levels(sums=(5.0, level)))
     words = f'psd_2: sum {level:.2f} V, the rig file says 5 V; see amplifier.sum_nominal'
     assert found.notes == ((words,) if reported else ())
-
-
-def test_hum_is_worth_a_look_where_it_is_largest() -> None:
-    hum = (0.0, 1e-3, 0.0, 4e-3, 0.0, 2e-3)
-    words = 'hum: 4.0 mV at 60 Hz on x2; look at shielding and ground'
-    assert checked(levels=of_levels(hum=hum, hum_hz=60.0)).notes == (words,)
-    for volt, reported in ((4.9495e-3, '4.9'), (4.9505e-3, '5.0')):
-        hum = (0.0, volt, 0.0, 0.0, 0.0, 0.0)
-        assert checked(levels=of_levels(hum=hum)).notes[0].startswith(f'hum: {reported} mV at 50 Hz on y1')
-    for channel, name in enumerate(('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')):
-        small = [1e-9 * (i == channel) for i in range(6)]
-        assert checked(levels=of_levels(hum=small)).notes[0].endswith(f'on {name}; look at shielding and ground')
-
-
-def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted() -> None:
-    minute = 1e-6 / 60.0
-    sd = 2.0**-24
-    for drift, deviation, reported in (
-        ((0.0, 5.1 * minute, 0.0, 0.0), 1e-9, '+5.1 µm a minute on y1'),
-        ((0.0, 4.9 * minute, 0.0, 0.0), 1e-9, ''),
-        ((-5.1 * minute, 0.0, 0.0, 0.0), 1e-9, '-5.1 µm a minute on x1'),
-        ((5.0 / 60e6, 0.0, 0.0, 0.0), 1e-9, ''),
-        ((4.99999995 * minute, 0.0, 0.0, 0.0), 1e-9, ''),
-        ((5.00000005 * minute, 0.0, 0.0, 0.0), 1e-9, '+5.0 µm a minute on x1'),
-        ((6.04999995 * minute, 0.0, 0.0, 0.0), 1e-9, '+6.0 µm a minute on x1'),
-        ((6.05000005 * minute, 0.0, 0.0, 0.0), 1e-9, '+6.1 µm a minute on x1'),
-        # The farthest of those that stand out.
-        ((6.0 * minute, 0.0, -7.0 * minute, 0.0), 1e-9, '-7.0 µm a minute on x2'),
-        ((0.0, 0.0, 0.0, 5.0 * sd), sd, ''),
-        ((0.0, 0.0, 0.0, 5.001 * sd), sd, '+17.9 µm a minute on y2'),
-        ((0.0, 0.0, 0.0, 1e-5), SIGNIFICANT_DRIFT, '+600.0 µm a minute on y2'),
-        # Of a short recording nothing is told.
-        ((0.0, 0.0, 0.0, 1e-5), 1.001 * SIGNIFICANT_DRIFT, ''),
-    ):
-        words = f'drift: {reported}; let lasers and amplifier warm up'
-        assert checked(drift=drift, drift_sd=deviation).notes == ((words,) if reported else ())
-    assert pytest.approx(5e-6 / 60.0) == SIGNIFICANT_DRIFT

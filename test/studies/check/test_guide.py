@@ -66,6 +66,7 @@ def verdict(known: Rig, guide: Guide) -> Checkup:
     return check(CheckProblem(known, guide.pushes, levels(known, guide.rest()), *guide.drift()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('number', range(0, 128, 9))
 @pytest.mark.parametrize('clumsy', [0.0, 0.3])
 def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
@@ -89,36 +90,6 @@ def test_a_turn_the_other_way_is_reported_beside_exchanged_psds() -> None:
     found = verdict(known, guide)
     assert [f.name for f in found.findings] == ['psd_swap']
     assert found.findings[0].equivalent == ('load_sign of tz',)
-
-
-def test_a_push_that_is_too_small_or_too_shaky_is_not_taken_and_reported() -> None:
-    known = load_rig()
-    guide, message = led(known, Bench(known, 2), hand_of(known, 2e-6), most=30.0)
-    assert (guide.phase, guide.number) == (Phase.PUSH, 0)
-    assert any(text.startswith('No push yet: the dots have moved by') for text in message)
-    guide, message = led(known, Bench(known, 3, tremor=1.0), hand_of(known, 0.2e-3), most=30.0)
-    assert not guide.pushes
-    assert 'Hold it steadier.' in message
-
-
-def test_a_link_that_is_not_let_go_is_waited_for() -> None:
-    known = load_rig()
-    bench, guide = Bench(known, 4), Guide(known)
-    push, _, _ = hand_of(known, 0.2e-3)
-    message = [guide.feed(bench.block(np.zeros(3))) for _ in range(150)]
-    message += [guide.feed(bench.block(push)) for _ in range(900)]
-    assert guide.phase is Phase.RELEASE
-    assert 'Let go of the link.' in message
-    assert guide.prompt() == 'Let go.'
-
-
-def test_a_link_that_moves_is_not_at_rest() -> None:
-    known = load_rig()
-    bench, guide = Bench(known, 5, tremor=1.0), Guide(known)
-    push, _, _ = hand_of(known, 0.2e-3)
-    message = [guide.feed(bench.block(push)) for _ in range(800)]
-    assert guide.phase is Phase.REST
-    assert any('leave it alone' in text for text in message)
 
 
 # ---- the phases, sample by sample
@@ -246,6 +217,7 @@ def test_rest_of_a_quiet_rig_may_still_wander_by_a_tenth_of_the_least_push() -> 
         assert fed.at(Phase.PUSH) is rests
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('shaking', 'size', 'taken'),
     [
@@ -284,13 +256,6 @@ def test_a_dot_at_the_end_of_its_range_is_reported_though_it_is_held() -> None:
         message = fed.feed((0.0, 0.0, -volt * 5e-4, 0.0), WAIT + 1)
         assert ('A dot is at the end of its PSD: push less.' in message) is ends
         assert any(text.startswith('Got it') for text in message) is not ends
-
-
-def test_how_far_the_dots_were_pushed_is_reported_in_whole_micrometres() -> None:
-    fed = Fed().rested()
-    assert fed.feed((1234.5006 * MICRO, -0.6 * MICRO, -999.4998 * MICRO, 0.0), 30)[-1] == (
-        'Got it: x1 +1235, y1 -1, x2 -999, y2 +0 µm.'
-    )
 
 
 @pytest.mark.parametrize(
@@ -337,29 +302,6 @@ def test_a_push_at_the_end_of_the_range_is_filled_and_no_more() -> None:
     for _ in range(30):
         assert fed.guide.feed(volts) == ''
     assert fed.at(Phase.PUSH, 1.0)
-
-
-def test_the_steadiness_of_a_hand_counts_by_the_pieces_in_which_it_let_go() -> None:
-    fed = Fed().rested()
-    fed.feed(FAR, 30, 20 * MICRO)
-    fed.guide.feed(np.zeros((600, 6)))
-    (taken,) = fed.guide.pushes
-    rest = 1e-6 * math.sqrt(100 * 1e-3 / 2.0)
-    assert taken.sd == pytest.approx([rest, math.hypot(rest, 20e-6), rest, rest])
-
-
-def test_ten_seconds_are_enough_and_thirty_are_all() -> None:
-    # 1024 samples a second: each second is one in floating point, too.
-    known = load_rig(overrides={'converter.sample_rate_hz': 1024.0})
-    guide = Guide(known)
-    message = []
-    for second in range(1, 31):
-        volts = np.zeros((1024, 6))
-        volts[:, 1] = 0.1 * (second % 2)
-        assert guide.phase is Phase.REST
-        message += [second] if guide.feed(volts) else []
-    assert message == [10, 20]
-    assert guide.phase is Phase.PUSH
 
 
 def test_one_rest_alone_has_no_drift() -> None:

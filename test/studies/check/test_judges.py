@@ -14,7 +14,6 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import LEAST_BITS
-from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import shared_findings
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.levels import levels
@@ -22,6 +21,7 @@ from psd_deflection.studies.check.levels import levels
 RIG = load_rig()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('noise', 'reported'), [(0.0034, False), (0.006, True), (0.0007, True)])
 def test_check_and_discover_say_the_same_of_the_noise(
     noise: float, reported: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -41,26 +41,6 @@ def test_check_and_discover_say_the_same_of_the_noise(
         assert of_check['value'] == pytest.approx(of_search['value'], rel=0.03)
         levels_reported = [float(f['fix'].removeprefix('amplifier.noise: ')) for f in (of_check, of_search)]
         assert levels_reported == pytest.approx([noise, noise], rel=0.05)
-
-
-def test_each_unit_has_its_factor() -> None:
-    """In N and N m: the standard acceleration is 9.80665 m/s^2, a pound 0.45359237 kg, an ounce a sixteenth of it."""
-    g, pound = 9.80665, 0.45359237
-    force = {'kg': g, 'g': g / 1000, 'lbf': g * pound, 'kN': 1000, 'mN': 1 / 1000, 'ozf': g * pound / 16}
-    torque = {'kg m': g, 'kg cm': g / 100, 'kg mm': g / 1000, 'kN m': 1000, 'N mm': 1 / 1000, 'N cm': 1 / 100}
-    for units, own, wanted in (
-        (shared_findings.FORCE_UNITS, 'N', force),
-        (shared_findings.TORQUE_UNITS, 'N m', torque),
-    ):
-        reported = {words: factor for factor, words in shared_findings.both_ways(units, own)}
-        there = {f'{unit} instead of {own}': factor for unit, factor in wanted.items()}
-        # What is a thousand times one way is it the other way too.
-        back = {
-            f'{own}, and then converted from {unit} once more': 1 / factor
-            for unit, factor in wanted.items()
-            if factor not in (1000, 1 / 1000)
-        }
-        assert reported == pytest.approx({**there, **back}, rel=2e-7)
 
 
 NAN = math.nan
@@ -151,21 +131,6 @@ def test_the_noise_of_steps_is_their_size_over_the_root_of_twelve() -> None:
     assert shared_findings.noise_findings(RIG, np.zeros(4)) == ([], {})
 
 
-def test_noise_of_a_channel_is_reported_with_its_factor() -> None:
-    rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
-    step = 20.0 / 2**16 / math.sqrt(12.0)
-    noise = np.array([2.34567 * math.hypot(1e-3, step), 2e-3, 4e-3, math.hypot(2e-3, step) / 3.21])
-    findings, lines = shared_findings.noise_findings(rig, noise)
-    assert [(f.name, f.where, f.value) for f in findings] == [
-        ('noise_level', 'x1', 2.346),
-        ('noise_level', 'y2', 0.312),
-    ]
-    assert [f.evidence for f in findings] == pytest.approx([math.log(2.34567), math.log(3.21)])
-    assert lines == {'psd_1.noise': [2.4e-3, 2e-3], 'psd_2.noise': [4e-3, 6.2e-4]}
-    noise[1] = math.nan
-    assert [f.where for f in shared_findings.noise_findings(rig, noise)[0]] == ['y2']
-
-
 @pytest.mark.parametrize(
     ('bits', 'step', 'right', 'words'),
     [
@@ -192,18 +157,3 @@ def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: 
     (found,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
     assert lines == {}
     assert not found.fix.startswith('converter.bits')
-
-
-def test_a_unit_has_the_evidence_that_is_reported_or_none() -> None:
-    sizes = np.array([9.80665, math.nan, math.nan])
-    assert shared_findings.unit_findings(sizes)[0][0].evidence == 0.0
-    (found,), factors = shared_findings.unit_findings(sizes, 7.0)
-    assert (found.name, found.where, found.value, found.evidence) == ('load_unit', 'fx', 9.80665, 7.0)
-    assert found.fix == 'multiply load_fx in the recording by 9.80665: it is noted in kg instead of N'
-    assert factors.tolist() == [9.80665, 1.0, 1.0]
-
-
-def test_a_turned_sign_has_the_value_minus_one_and_an_exchange_none() -> None:
-    wiring = Wiring(True, (('y', 'x'), ('x', '-y')))
-    findings, _ = shared_findings.wiring_findings(wiring, Wiring.from_rig(RIG), 0.0)
-    assert [(f.name, f.value) for f in findings] == [('psd_swap', None), ('axis_swap', None), ('channel_sign', -1.0)]

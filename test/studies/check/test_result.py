@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psd_deflection.base.charts import Chart
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.levels import Levels
@@ -21,8 +20,6 @@ from psd_deflection.studies.check.result import (
     WRONG,
     Checkup,
     Finding,
-    answers_chart,
-    arrow,
     finding_tree,
     level_rows,
     other_causes,
@@ -180,31 +177,6 @@ def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> Non
         'y2',
         'size',
     ]
-
-
-def test_an_arrow_is_nothing_below_a_tenth() -> None:
-    assert [arrow(v, 2.0) for v in (0.0, 0.19, -0.19, 0.25, -0.25, 5.0)] == ['0', '0', '0', '+', '-', '+']
-    assert arrow(0.5, 5.0) == '+'
-
-
-def test_the_chart_has_a_panel_a_channel_two_beside_each_other_in_micrometres() -> None:
-    chart = answers_chart(CHECKUP)
-    assert isinstance(chart, Chart)
-    # x and y of one PSD beside each other.
-    assert chart.beside == 2
-    assert [p.y_label for p in chart.panels] == ['x1 / µm', 'y1 / µm', 'x2 / µm', 'y2 / µm']
-    # On the channels of the file: x1 is turned.
-    expected = [[1.0, 0.0], [0.0, 2.0], [1.0, 0.0], [0.01, -1.0]]
-    moved = [[1.0, 0.0], [-2.04, 0.0], [0.0, -0.01], [4.0, 1000.0]]
-    spread = [[0.1, 0.1], [0.1, 0.2], [0.1, 0.3], [0.1, 0.4]]
-    for i, panel in enumerate(chart.panels):
-        by_file, measured = panel.series
-        assert by_file.x.tolist() == measured.x.tolist() == [1.0, 2.0]
-        assert by_file.y == pytest.approx(expected[i])
-        assert measured.y == pytest.approx(moved[i])
-        assert by_file.half_width is None
-        assert measured.half_width is not None
-        assert measured.half_width == pytest.approx(spread[i])
 
 
 def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:

@@ -17,7 +17,6 @@ from psd_deflection.studies.check.wirings import (
     fitting_wirings,
     fix_of,
     line,
-    misfit,
     parameters,
     pattern,
     scales_of,
@@ -92,17 +91,6 @@ def test_the_misfit_is_the_share_of_the_square_that_the_pattern_leaves() -> None
     assert turn.misfit(PLAIN) == pytest.approx((16.0 / 20.0, 1.0))
     # With the wiring turned the PSDs see x1 = -y2, y1 = x2, x2 = x1, y2 = y1.
     assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).misfit(ROTATED) == pytest.approx((0.0, 1.0), abs=1e-12)
-
-
-def test_a_movement_against_the_push_is_not_explained_unless_its_load_is_turned() -> None:
-    forth = push([3.0, 4.0, 0.0, 0.0], [4.0, 0.0, 0.0, 0.0], ('fx',))
-    back = push([-4.0, 3.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], ('fy', 'tz'))
-    assert misfit(PLAIN, [forth, back]) == pytest.approx((0.64 + 1.0, 1.0))
-    assert misfit(PLAIN, [forth, back], ('fy', 'tz')) == pytest.approx((0.64 + 0.36, 0.64))
-    # One of two that came together is not both.
-    assert misfit(PLAIN, [forth, back], ('fy',)) == pytest.approx((0.64 + 1.0, 1.0))
-    assert misfit(PLAIN, [forth, back], ('fx', 'fy', 'tz')) == pytest.approx((1.0 + 0.36, 1.0))
-    assert misfit(PLAIN, []) == (0, 0.0)
 
 
 def of_plate(*rows: tuple[str, float], lean: float = 0.0) -> list[PushResponse]:

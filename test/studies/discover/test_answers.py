@@ -34,7 +34,6 @@ from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Cell, Dependence, Localisation
 from psd_deflection.studies.discover.search.screen import promising
 from psd_deflection.studies.discover.search.signatures import Candidate, candidates, signature_columns
-from psd_deflection.studies.discover.search.trials import far, slot, unbound, unphysical
 from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, Unknown, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
@@ -69,27 +68,6 @@ def some_samples(**given: Any) -> SimulatedSamples:
     rows = {'pose': rng.normal(size=(3, n)), 'dots': rng.normal(size=(4, n)), 'beams': rng.normal(size=(4, n))}
     t = np.arange(n, dtype=np.float64) * 1e-3
     return SimulatedSamples(t, 0.0 * t, rng.normal(size=(3, n)), Physics.of(RIG), **{**rows, **given})
-
-
-def test_a_mistake_is_declared_once_for_each_place() -> None:
-    names = [e.name for e in mistakes(1, [], [])]
-    assert names == ['sensitivity', 'link_length', 'sample_rate', 'bending_frequency', 'torsion_frequency']
-    listed = mistakes(2, [0.04], [(1, 2, 30.5), (2, 1, 0.25)])
-    assert [e.name for e in listed] == [*names, 'load_delay', 'zero', 'jump', 'jump']
-    assert listed[5].parameter('late_by').grid == (0.04,)
-    assert [v['recording'] for v in listed[6].variants()] == [1.0, 1.0, 2.0, 2.0]
-    assert [v['of_reading'] for v in listed[6].variants()] == [0.0, 1.0, 0.0, 1.0]
-    assert [dict(next(e.variants())) for e in listed[7:]] == [
-        {'recording': 1.0, 'psd': 2.0, 'time_us': 30_500_000.0},
-        {'recording': 2.0, 'psd': 1.0, 'time_us': 250_000.0},
-    ]
-    # Of a rig: each recording and each PSD has one, all others one in all.
-    assert [[p.name for p in e.parameters if p.each] for e in listed] == [
-        *([],) * 6,
-        ['recording'],
-        ['recording', 'psd'],
-        ['recording', 'psd'],
-    ]
 
 
 def test_what_a_mistake_does_is_what_its_name_says() -> None:
@@ -375,31 +353,6 @@ def test_a_step_is_coarse_from_three_counts_on(counts: int, observed: bool) -> N
 # The search's small rules.
 
 
-def test_what_ran_into_a_bound_is_something_else(workspace: Workspace) -> None:
-    size = EffectParameter('a', 'V', 0.0, 1.0, 0.1, '')
-    shape = EffectParameter('f', 'Hz', 1.0, 60.0, 1.0, '', nominal=5.0, kind='shape')
-    effect = declared(size, dataclasses.replace(size, name='b'), shape)
-    jacobian = np.ones((5, 3)) * [1.0, 2.0, 3.0]
-    for values, bound, wrong in (
-        ((0.5, 0.5, 5.0), (), False),
-        ((0.5, 0.0, 5.0), ('b',), False),
-        ((0.0, 0.0, 5.0), ('a', 'b'), True),
-        ((0.5, 1.0, 5.0), ('b',), True),
-        ((0.5, 0.5, 60.0), ('f',), True),
-    ):
-        active = ActiveEffect(effect, dict(zip('abf', values, strict=True)))
-        free = tuple((0, n) for n in 'abf')
-        fit = Fit((active,), 1.0, np.zeros(5), [], jacobian, free, tuple((0, n) for n in bound))
-        assert unphysical(workspace, fit, 0) == wrong
-        keep = [i for i, n in enumerate('abf') if n not in bound]
-        np.testing.assert_array_equal(unbound(fit), jacobian[:, keep])
-    assert far(dataclasses.replace(fit, chi2=50.1))
-    assert not far(dataclasses.replace(fit, chi2=49.9))
-    jump = of_setup('jump')
-    assert slot(jump, {'recording': 1.0, 'psd': 2.0, 'time_us': 7.0}) == ('jump', 1.0, 2.0)
-    assert slot(effect, {}) == ('made_up',)
-
-
 def test_the_best_of_each_variant_is_tried() -> None:
     def score(name: str, gain: float, dof: int = 1) -> Any:
         return SimpleNamespace(gain=gain, dof=dof, candidate=SimpleNamespace(variant=(name,)))
@@ -557,25 +510,6 @@ def test_a_gap_that_remains_is_never_left_unreported() -> None:
     assert u.unexplained
 
 
-def test_a_waterfall_falls_effect_by_effect() -> None:
-    names = ('creep', 'damping', 'tip_mass')
-    effects = tuple(ActiveEffect(EVERY[name], {}) for name in names)
-    base = ActiveEffect(EVERY['plane_tilt'], {})
-    fake = SimpleNamespace(
-        base=(base,),
-        residual=lambda e: (None, [a.effect.name for a in e]),
-        gap=lambda d: 10.0 - len(d),
-        floor=lambda: 0.5,
-    )
-    for count in range(4):
-        fit = cast(Fit, SimpleNamespace(effects=effects[:count], nuisance=()))
-        steps = [('as described', 20.0), ('+ creep', 8.0), ('+ damping', 7.0), ('+ tip_mass', 1.0)][: count + 1]
-        if count:
-            steps[-1] = (steps[-1][0], 1.0)
-        got = weighing.waterfall_of(cast(Workspace, fake), fit, 20.0, 1.0)
-        assert got == (*steps, ('noise alone', 0.5))
-
-
 # The files.
 
 
@@ -589,23 +523,6 @@ def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
         'fitted_alternatives': (),
     }
     return NamedEffect(active, **{**full, 'alternatives': (), 'suggestion': None, **given})
-
-
-@pytest.mark.parametrize(
-    ('value', 'sd', 'words'),
-    [
-        (0.003987, 2e-5, 'angle 0.003987 ± 2e-05 rad'),
-        (0.1234, 0.05, 'angle 0.12 ± 0.05 rad'),
-        (0.123, 0.0, 'angle 0.1 ± 0 rad'),
-        (0.1, 0.051, ''),
-        (-1.23456789, 1e-9, 'angle -1.23457 ± 1e-09 rad'),
-    ],
-)
-def test_a_size_is_reported_to_the_digits_that_its_deviation_leaves(value: float, sd: float, words: str) -> None:
-    """Two digits more than the deviation's first, six at most; within two deviations of nothing it is none."""
-    effect = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': value}, 't'), sd={'angle': sd})
-    assert trees.size_of(effect) == words
-    assert trees.size_of(dataclasses.replace(effect, sd={})) == ''
 
 
 def test_numbers_of_json_are_finite() -> None:

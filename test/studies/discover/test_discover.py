@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from psd_deflection.studies.check.result import NAMES, Finding
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
-from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import solve_observable
 from psd_deflection.studies.discover.search.signatures import SignatureBank
@@ -63,6 +61,7 @@ def rotated() -> Discovery:
     return discover([observe(with_effect('sensor_rotation', psd=2, angle=0.002))], RIG, bank=BANK)
 
 
+@pytest.mark.slow
 def test_nothing_missing_is_the_answer_to_noise() -> None:
     found = discover([observe(RIG, seed=7)], RIG, bank=BANK)
     assert found.verdict == 'nothing_missing'
@@ -71,6 +70,7 @@ def test_nothing_missing_is_the_answer_to_noise() -> None:
     assert found.sentence.startswith('Nothing is missing')
 
 
+@pytest.mark.slow
 def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
     assert rotated.verdict == 'effects_found'
     (effect,) = rotated.effects
@@ -81,49 +81,6 @@ def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
     assert rotated.gap_before > 4 * rotated.gap_after
     assert rotated.gap_heldout_after < 1.05 * rotated.gap_floor
     assert rotated.simulations < 2000
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('large', 'small'),
-    [
-        # 2 µm on one channel behind 100 µm of hum; ten floors behind sixty micrometres of a softer link.
-        (
-            {
-                'name': 'mains_interference',
-                'frequency': 50.03,
-                **{f'amplitude_{c}': 0.2 for c in ('x1', 'y1', 'x2', 'y2')},
-            },
-            {'name': 'axis_crosstalk', 'psd': 2, 'xy': 0.004, 'yx': 0.0},
-        ),
-        (
-            {'name': 'bending_stiffness', 'scale': -0.06},
-            {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.004},
-        ),
-    ],
-)
-def test_a_small_effect_behind_a_large_one_is_named_too(large: dict[str, object], small: dict[str, object]) -> None:
-    rig = replace_values(
-        RIG, {f'effects.{key}.{k}': v for key, e in (('a', large), ('b', small)) for k, v in e.items()}
-    )
-    found = discover([observe(rig, seed=4)], RIG, bank=BANK, without=[n for n in effect_names() if n not in NEAR])
-    assert found.verdict == 'effects_found'
-    assert {e.active.effect.name for e in found.effects} == {large['name'], small['name']}
-    assert found.floors < 1.05
-    tree = found.tree()
-    assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
-    assert f'{found.floors:.2f} times what noise alone leaves' in found.sentence
-
-
-@pytest.mark.slow
-def test_a_size_that_the_recordings_leave_open_has_no_number_for_its_sd(rotated: Discovery) -> None:
-    without = replace(rotated, effects=tuple(replace(e, sd={'angle': 14000.0}) for e in rotated.effects))
-    known, left_open = (
-        ''.join(map(str, s.parts)) for found in (rotated, without) for s in found.sections() if s.title == 'What'
-    )
-    assert 'not determined' not in known
-    assert 'not determined' in left_open
-    assert '1.4e+04' not in left_open
 
 
 @pytest.mark.slow
@@ -174,65 +131,11 @@ def check_schema(tree: dict[str, Any]) -> None:
     jsonschema.validate(json.loads(json.dumps(tree, allow_nan=False)), SCHEMA)
 
 
+@pytest.mark.slow
 def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
     tree = rotated.tree()
     check_schema(tree)
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
-
-
-@pytest.mark.slow
-def test_what_one_length_cannot_report_two_can() -> None:
-    one = discover([observe(with_effect('clamp_bending_compliance', compliance=2e-7))], RIG, bank=BANK)
-    (effect,) = one.effects
-    names = {effect.active.effect.name, *effect.equivalent}
-    assert names == {'clamp_bending_compliance', 'bending_stiffness'}
-    assert effect.suggestion is not None
-    assert 'link of 0.41 m' in effect.suggestion.text
-    short = replace_values(RIG, {'link.length': 0.4})
-    hidden = {'effects.e.name': 'clamp_bending_compliance', 'effects.e.compliance': 2e-7}
-    both = [
-        observe(replace_values(RIG, hidden)),
-        observe(replace_values(short, hidden), seed=1, known=short),
-    ]
-    (effect,) = discover(both, RIG).effects
-    assert effect.active.effect.name == 'clamp_bending_compliance'
-    assert effect.equivalent == ()
-
-
-@pytest.mark.slow
-def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
-    history = loads.steps([(0, 0, 0), (5, -20, -9), (0, 0, 0)], 0.5).loads
-    zero = {'effects.e.name': 'tip_force', 'effects.e.x': 0.05, 'effects.e.y': -0.1}
-    observed = []
-    for i, length in enumerate((0.585, 0.4)):
-        own = replace_values(RIG, {'link.length': length})
-        observed.append(observe(replace_values(own, zero), seed=i, known=own, history=history))
-    found = discover(observed, RIG)
-    (effect,) = found.effects
-    assert effect.active.effect.name == 'tip_force'
-    for name, force in (('x', 0.05), ('y', -0.1)):
-        assert abs(effect.active.values[name] - force) < 4.0 * effect.sd[name] < 0.01
-    # 0.1 N bends the link by 4.5 um; the estimates say so rightly.
-    assert found.moves == (0.0, 0.0, 0.0)
-    assert 'an estimate is wrong' not in found.sentence
-    assert 'The estimates of the pose are right without' in found.sentence
-
-
-@pytest.mark.slow
-def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
-    observed = observe(RIG, seed=3)
-    volts = observed.volts.copy()
-    # The square of y2 leaks into x2: in no catalogue.
-    volts[:, 3] += 0.004 * volts[:, 4] ** 2
-    found = discover([Observation('alien', RIG, volts, observed.loads, observed.temperature)], RIG, bank=BANK)
-    assert found.verdict == 'unknown_effect'
-    assert 'x2' in found.unknown[0].signature
-    check_schema(found.tree())
-
-
-def two_effects(first: dict[str, object], second: dict[str, object]) -> Rig:
-    both = {'a': first, 'b': second}
-    return replace_values(RIG, {f'effects.{k}.{n}': v for k, e in both.items() for n, v in e.items()})
 
 
 @pytest.mark.slow
@@ -248,14 +151,6 @@ def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     assert 'their sizes are tied' in found.sentence
     # With the cause in the library it is named alone.
     assert [e.active.effect.name for e in discover([lag], RIG, bank=BANK).effects] == ['amplifier_lag']
-
-
-@pytest.mark.slow
-def test_independent_sizes_are_left_alone() -> None:
-    skews = [{'name': 'channel_skew', 'psd': psd, 'delay': delay} for psd, delay in ((1, 2e-5), (2, 3.1e-5))]
-    found = discover([observe(two_effects(*skews))], RIG, bank=BANK)
-    assert found.verdict == 'effects_found'
-    assert coincidences(found.fit, found.workspace.physics) == []
 
 
 @pytest.mark.slow
@@ -350,20 +245,6 @@ def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatc
     later = ParameterChange(0, 3, (('psd_2.zero', (1e-4, -2e-4)), ('environment.temperature', 22.0)))
     monkeypatch.setattr(recording, 'changes', [later])
     assert rig_at_end(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
-
-
-@pytest.mark.slow
-def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ['--loads', 'thesis:1', '--effect', 'creep,amplitude=0.02,time_constant=1', '--temperature', '20,22']
-    answers = []
-    for name in ('run.csv', 'run'):
-        assert main(['simulate', '--out', str(tmp_path / name), *words]) == 0
-        assert main(['discover', str(tmp_path / name), '--out', str(tmp_path / ('of_' + name)), '--quiet']) == 0
-        answers.append(json.loads((tmp_path / ('of_' + name) / 'result.json').read_text()))
-    assert [a['effects'][0]['name'] for a in answers] == ['creep'] * 2
-    first, second = (a['effects'][0]['parameters']['amplitude']['value'] for a in answers)
-    assert first == pytest.approx(second, rel=1e-3)
-    capsys.readouterr()
 
 
 @pytest.mark.slow

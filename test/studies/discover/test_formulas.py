@@ -17,16 +17,15 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover import experiment
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.localise import plain_word, regressors
 from psd_deflection.studies.discover.search.trust import energies, gain_beyond
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
+from psd_deflection.studies.discover.setup.cleaning import clean, stuck
 from psd_deflection.studies.discover.setup.noise import NoiseModel, rest_windows, strip_lines
 
 RIG = load_rig()
@@ -62,57 +61,6 @@ def script(levels: list[tuple[float, float, float]], dwell: float) -> tuple[str,
         return f'{round(v, 3) + 0.0:g}'
 
     return ('steps:' + ';'.join(','.join(map(number, level)) for level in levels) + f':{dwell:g}',)
-
-
-@pytest.mark.parametrize('zero', [0.0, 5e-4])
-@pytest.mark.parametrize('sideways', [True, False])
-def test_what_can_be_done_to_a_link_uses_the_room_on_its_sensors(sideways: bool, zero: float) -> None:
-    """A force bends by L^3/(3 EI), a torque twists by L/GJ; the dots may go 80 % of the way to the edge."""
-    rig = replace_values(RIG, {'psd_2.zero': [0.0, -zero], 'link.youngs_modulus': 7e9})
-    link = rig.link
-    per_force, per_torque = link.length**3 / (3.0 * link.bending_stiffness), link.length / link.torsional_stiffness
-    half = 0.5 * min(min(p.active_area) for p in rig.psds)
-    room = 0.8 * (min(half, rig.converter.full_scale * float(rig.sensitivities.min())) - zero)
-    reach = max(math.hypot(*c) for c in rig.centers.tolist())
-    f, t = min(50.0, room / per_force), min(29.25, room / (per_torque * reach))
-    assert f < 50.0
-    arm = loads.SIDEBAR_ARM
-    bar = room / (per_force + arm * per_torque * reach)
-    o, h = (0.0, 0.0, 0.0), (0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25)
-    up = [0.0, *h, 0.0]
-    want: list[tuple[str, ...]] = []
-    if sideways:
-        want.append(script([o, (0, -f, 0), o, (0, f, 0), o, (f, 0, 0), o, (-f, 0, 0), o], 1.5))
-        want.append(script([o, (0, 0, t), o, (0, 0, -t), o], 2.0))
-        g, u = f / 2, 0.6 * t
-        corners = [(1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1), (1, 1, -1), (-1, -1, -1)]
-        want.append(script([o, *((a * g, b * g, c * u) for a, b, c in corners), o], 1.5))
-    else:
-        want.append(script([o, (0, -f, 0), o, (0, -f / 2, 0), o], 2.0))
-    want.append(script([o, (0, -bar, -bar * arm), o, (0, -bar, bar * arm), o], 2.0))
-    want.append(script([(0, -s * f, 0) for s in up], 1.5))
-    if sideways:
-        want.append(script([(s * f, 0, 0) for s in up], 1.5))
-        want.append(script([(0, 0, s * t) for s in up], 1.5))
-
-    def n(v: float) -> str:
-        return f'{round(v, 3) + 0.0:g}'
-
-    twist = -0.3 * t if sideways else 0.0
-    want.append(('constant:0,0,0:1', f'constant:0,{n(-0.8 * f)},{n(twist)}:24', 'constant:0,0,0:14.4'))
-    want.append(('constant:0,0,0:30',))
-    want.append((f'chirp:{n(0.06 * f)},{n(0.06 * f)},{n(0.07 * t)}:2,40:15',))
-    want.append((f'chirp:{n(0.3 * f)},{n(0.3 * f)},{n(0.3 * t)}:40,150:12',))
-    got = pieces(rig, Limits(sideways=sideways))
-    assert [p.script for p in got] == want
-    # The words name the same sizes.
-    assert got[0].words.startswith(f'{f:.3g} N along -Y' if sideways else f'weights of {f:.3g} N and half of it')
-    assert got[len(got) - 4].words == f'{0.8 * f:.3g} N held for 24 s, then 14.4 s unloaded'
-    assert [p.words for p in got[-3:]] == [
-        '30 s unloaded',
-        'a sweep from 2 to 40 Hz on both axes and in torsion',
-        'a sweep from 40 to 150 Hz on both axes and in torsion',
-    ]
 
 
 @pytest.mark.parametrize(
@@ -223,66 +171,6 @@ def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:
 
 
 # Where, and on what it depends.
-
-
-def test_regressors_are_the_words_they_have(workspace: Workspace) -> None:
-    named = regressors(workspace)
-    assert [channel for channel, _ in named] == list(CHANNELS)
-    # One table for each PSD, of its channels.
-    table = [of for _, of in named][::3]
-    assert [list(of) for _, of in named] == [list(table[0])] * 6
-    for r, o in enumerate(workspace.observations):
-        samples = ForwardModel(RIG, []).run(o.loads, o.temperature)
-
-        def mean(row: FloatArray) -> FloatArray:
-            return np.asarray(row.reshape(-1, 4).mean(axis=1), dtype=np.float64)
-
-        dots, (fx, fy, tz) = [1e3 * mean(d) for d in samples.dots], map(mean, o.loads.T)
-        n = len(fx)
-        t = np.arange(n) / n
-        warmer = mean(o.temperature - o.temperature[0]) if o.temperature is not None else np.zeros(n)
-        ways = np.zeros_like(o.loads)
-        for k in range(3):
-            way = 0.0
-            for i in range(1, len(o.loads)):
-                change = o.loads[i, k] - o.loads[i - 1, k]
-                way = math.copysign(1.0, change) if change else way
-                ways[i, k] = way
-        for psd in range(2):
-            x, y = dots[2 * psd], dots[2 * psd + 1]
-            dx, dy = np.gradient(x), np.gradient(y)
-            want = {
-                'constant': t**0,
-                'time': t,
-                'time^2': t * t,
-                'load_fx': fx,
-                'load_fy': fy,
-                'load_tz': tz,
-                'load_fx^2': fx * fx,
-                'load_fy^2': fy * fy,
-                'load_tz^2': tz * tz,
-                'dot_x': x,
-                'dot_y': y,
-                'dot_x^2': x * x,
-                'dot_y^2': y * y,
-                'dot_x dot_y': x * y,
-                'dot_x r^2': x**3 + x * y**2,
-                'dot_y r^2': y**3 + y * x**2,
-                '|dot_x|': abs(x),
-                '|dot_y|': abs(y),
-                'rate of dot_x': dx,
-                'rate of dot_y': dy,
-                '|rate of dot_x|': abs(dx),
-                '|rate of dot_y|': abs(dy),
-                'history of load_fx': mean(ways[:, 0]),
-                'history of load_fy': mean(ways[:, 1]),
-                'history of load_tz': mean(ways[:, 2]),
-                'temperature': warmer,
-                'temperature^2': warmer * warmer,
-            }
-            assert set(want) == set(table[psd])
-            for name, values in want.items():
-                np.testing.assert_allclose(table[psd][name][r], values, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
 def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
@@ -426,25 +314,6 @@ def test_of_many_lines_the_strongest_four_are_stripped() -> None:
 # What of a recording is no measurement.
 
 
-def test_a_single_wild_sample_of_any_place_is_an_outlier_and_no_other() -> None:
-    rng = np.random.default_rng(5)
-    residual = 1e-3 * rng.standard_normal((400, 6))
-    places = {(0, 0), (1, 1), (50, 2), (51, 2), (200, 3), (398, 4), (399, 5)}
-    for i, c in places:
-        residual[i, c] += 0.05 if i % 2 else -0.05
-    found = outliers(residual, 1e-4)
-    assert {(int(i), int(c)) for i, c in np.argwhere(found)} == places
-    residual[::10, 0] = np.nan
-    assert not outliers(residual, 1e-4)[::10, 0].any()
-    # What is 7 deviations off is none, though five places from one, whose neighbours' cubics it does not spoil.
-    calm = 1e-3 * rng.standard_normal((400, 6))
-    calm[90:111] = 0.0
-    calm[100], calm[[95, 105]] = 0.5, 7e-3
-    assert np.flatnonzero(outliers(calm, 1e-4).any(axis=1)).tolist() == [100]
-    # Below the least standard deviation that is assumed nothing stands out.
-    assert not outliers(residual, 0.05).any()
-
-
 @pytest.mark.parametrize(('count', 'is_stuck'), [(29, False), (30, True)])
 def test_a_channel_is_stuck_from_three_hundredths_of_a_second_on(count: int, is_stuck: bool) -> None:
     rng = np.random.default_rng(6)
@@ -490,20 +359,3 @@ def test_what_is_known_of_a_recording_is_reported() -> None:
     assert findings == []
     assert np.isnan(quiet.volts).all(axis=1).sum() == 60
     assert clean(o, ())[0] is o
-
-
-@pytest.mark.parametrize(
-    ('regressor', 'word'),
-    [
-        ('load_fx^2', 'load_fx'),
-        ('history of load_fy', 'load_fy'),
-        ('load_tz', 'load_tz'),
-        ('|rate of dot_x|', 'rate'),
-        ('dot_x dot_y', 'dot_position'),
-        ('temperature^2', 'temperature'),
-        ('time', 'time'),
-        ('constant', 'constant'),
-    ],
-)
-def test_a_regressor_has_a_plain_word(regressor: str, word: str) -> None:
-    assert plain_word(regressor) == word

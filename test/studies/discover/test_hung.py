@@ -20,7 +20,6 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.free_loads import refitted
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
-from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.fit import refit
@@ -31,37 +30,13 @@ from psd_deflection.studies.discover.setup.applied import ringing_on, unseen
 from psd_deflection.studies.discover.setup.redundant import excess
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 from psd_deflection.studies.loads.steps import applied
-from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, annotated_as, read
-
-NUMBER = np.arange(len(HELD))
-
+from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, read
 
 ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
 
 
 def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
     return discover([Observation('x', RIG, volts, annotated)])
-
-
-@pytest.mark.slow
-def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> None:
-    found = searched(read(HELD, **ROTATED), annotated_as(2, (0, -20, 0)))
-    assert [(f.name, f.where) for f in found.setup] == [('missing_load', '8.000 s')]
-    assert found.setup[0].value == pytest.approx((0.0, -50.0, 0.0), abs=0.2)
-    assert 'not noted: from 8.000 s to 12.000 s (0 N, -50 N, 0 N m) hung, not (0 N, -20 N, 0 N m)' in found.setup[0].fix
-    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
-    assert found.effects[0].active.values['angle'] == pytest.approx(0.004, abs=4.0 * found.effects[0].sd['angle'])
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.05
-
-
-@pytest.mark.slow
-def test_a_load_that_was_noted_twice_is_reported() -> None:
-    found = searched(read(HELD), annotated_as(5, (80, -80, 40)))
-    assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 5')]
-    assert 'the 5th load of x was noted wrong' in found.setup[0].fix
-    assert '(40 N, -40 N, 20 N m) hung, not (80 N, -80 N, 40 N m)' in found.setup[0].fix
-    assert found.verdict == 'nothing_missing'
 
 
 @pytest.mark.slow
@@ -76,19 +51,6 @@ def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> N
     assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
     assert found.verdict == 'effects_found'
     assert found.law is None
-
-
-@pytest.mark.slow
-def test_rounded_loads_beside_beam_drift_are_reported() -> None:
-    drift = {'effects__e__name': 'laser_pointing_drift', 'effects__e__psd': 2}
-    rates = {'effects__e__rate_x': 5e-6, 'effects__e__rate_y': -5e-6}
-    found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0), **drift, **rates), np.repeat(ROUNDED, DWELL, axis=0))
-    assert [(f.name, f.where) for f in found.setup] == [('load_value', f'load {i}') for i in range(1, 7)]
-    assert [e.active.label for e in found.effects] == ['laser_pointing_drift (psd 2)']
-    assert found.effects[0].active.values['rate_x'] == pytest.approx(5e-6, rel=2e-3)
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.05
-    assert found.simulations <= 600
 
 
 @pytest.mark.slow
@@ -122,62 +84,12 @@ def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('force', 'frequency'), [(1.0, 1.3), (2.0, 1.6)])
-def test_a_weight_that_sways_is_reported_and_its_time_left_out(force: float, frequency: float) -> None:
-    """So much that its swings are taken for steps of a load that nobody noted, too."""
-    acting = HELD.copy()
-    at = (NUMBER - 3 * DWELL) / 1000.0
-    acting[:, 0] += np.where((at > 0.0) & (at < 4.0), force * np.sin(2.0 * np.pi * frequency * at), 0.0)
-    found = searched(read(acting), HELD)
-    assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 3')]
-    assert f'from 12.000 s to 16.000 s swayed at {frequency}' in found.setup[0].fix
-    assert found.setup[0].value is None
-    assert found.setup[0].evidence == pytest.approx(force, rel=0.1)
-    assert found.verdict == 'nothing_missing'
-
-
-@pytest.mark.slow
-def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> None:
-    """It keeps where the load was, so that a corrected load must not turn back by a thousandth behind its step."""
-    sticks = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
-    annotated = np.tile(LEVELS[0], (len(HELD), 1))
-    for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
-        annotated[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    found = searched(read(HELD, **sticks), annotated)
-    assert [f.name for f in found.setup] == ['load_time'] * 7
-    assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
-    assert found.effects[0].active.values['width'] == pytest.approx(1.4e-5, rel=5e-3)
-    assert (found.verdict, found.unknown) == ('effects_found', ())
-    assert found.floors < 1.05
-
-
-@pytest.mark.slow
 def test_the_noise_of_a_load_cell_is_no_effect() -> None:
     noise = np.random.default_rng(1).normal(size=HELD.shape) * (0.05, 0.05, 0.01)
     found = searched(read(HELD), HELD + noise)
     assert found.verdict == 'nothing_missing'
     assert not found.setup
     assert found.floors < 1.05
-
-
-def prepared(volts: FloatArray, annotated: FloatArray) -> Recorded:
-    recorded = Recorded((Observation('x', RIG, volts, annotated),), RIG, ())
-    for step in STEPS:
-        recorded = step(recorded)
-    return compared(recorded)[0]
-
-
-@pytest.mark.slow
-def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
-    soft = read(HELD, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
-    for volts, annotated in ((read(HELD), HELD), (read(HELD), 1.3 * HELD), (soft, HELD)):
-        fourth = prepared(volts, annotated).fourth
-        assert fourth is not None
-        assert fourth.acquits
-        assert 0.8 * fourth.values < fourth.chi_square < 1.05 * fourth.values
-    rotated = prepared(read(HELD, **ROTATED), HELD).fourth
-    assert rotated is not None
-    assert not rotated.acquits
 
 
 @pytest.mark.slow
@@ -217,16 +129,6 @@ def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> No
     found = searched(read(HELD, dynamics__bending_frequency=14.0 * 0.97), HELD)
     assert [(e.name, e.equivalent) for e in found.effects] == [('tip_mass', ('bending_frequency',))]
     assert found.setup == ()
-
-
-@pytest.mark.slow
-def test_other_frequencies_are_reported_beside_an_effect() -> None:
-    true = {'dynamics__bending_frequency': 14.0 * 1.05, 'dynamics__torsion_frequency': 21.0 * 0.97}
-    found = searched(read(HELD, **true, **ROTATED), HELD)
-    sizes = {e.name: e.values for e in found.effects}
-    assert set(sizes) == {'bending_frequency', 'torsion_frequency', 'sensor_rotation'}
-    assert sizes['sensor_rotation']['angle'] == pytest.approx(0.004, abs=2e-5)
-    assert found.verdict == 'effects_found'
 
 
 @pytest.mark.slow
@@ -280,59 +182,6 @@ def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: floa
     assert found.floors < 1.05
 
 
-@pytest.mark.slow
-def test_small_delays_beside_a_second_mode_are_found() -> None:
-    mode = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
-    found = searched(
-        read(HELD, **{f'effects__e__{k}': v for k, v in mode.items()}), np.vstack((np.zeros((2, 3)), HELD[:-2]))
-    )
-    assert [f.name for f in found.setup] == ['load_delay']
-    assert found.setup[0].value == pytest.approx(0.002, abs=1e-5)
-    assert [e.active.effect.name for e in found.effects] == ['second_bending_mode']
-    assert found.effects[0].active.values['frequency'] == pytest.approx(107.0, abs=0.1)
-    assert (found.verdict, found.unknown) == ('effects_found', ())
-
-
-@pytest.mark.slow
-def test_the_first_load_noted_twice_is_reported_if_no_other_pulls_that_way() -> None:
-    down = [(0, -20, 0), (0, -40, -23.4), (0, -10, 0), (0, -30, 17.55)]
-    acting = np.repeat(np.array([(0, 0, 0), (15, 0, 0), *down, (0, 0, 0)]), DWELL, axis=0)
-    annotated = acting.copy()
-    annotated[DWELL : 2 * DWELL] *= 2.0
-    more = {'name': 'sensor_gain', 'psd': 1, 'x': 0.004, 'y': 0.004}
-    found = searched(read(acting, **{f'effects__e__{k}': v for k, v in more.items()}), annotated)
-    assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 1')]
-    assert found.setup[0].value == pytest.approx((15.0, 0.0, 0.0), abs=0.05)
-    assert [e.active.label for e in found.effects] == ['sensor_gain (psd 1)']
-    assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
-
-
-@pytest.mark.slow
-def test_no_noise_is_reported_of_what_rings_and_is_unknown() -> None:
-    ringing = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
-    volts = read(HELD, **{f'effects__e__{k}': v for k, v in ringing.items()})
-    found = discover([Observation('x', RIG, volts, HELD)], without=('second_bending_mode',))
-    assert found.verdict == 'unknown_effect'
-    assert 'noise_level' not in [f.name for f in found.setup]
-
-
-@pytest.mark.slow
-def test_loads_that_are_one_sample_late_are_reported() -> None:
-    found = searched(read(HELD), np.vstack((np.zeros((1, 3)), HELD[:-1])))
-    assert [f.name for f in found.setup] == ['load_delay']
-    assert found.setup[0].value == pytest.approx(0.001, abs=1e-5)
-    assert (found.verdict, found.effects) == ('nothing_missing', ())
-
-
-@pytest.mark.slow
-def test_a_spot_that_is_clipped_at_the_ends_of_the_swing_alone_is_found() -> None:
-    """For moments a dot is far off: the fourth reading, in which an outlier counts little, acquits nothing then."""
-    clipped = {'effects__e__name': 'spot_clipping', 'effects__e__psd': 1, 'effects__e__radius': 2e-3}
-    found = searched(read(HELD, **clipped), HELD)
-    assert [(e.active.effect.name, e.active.values['psd']) for e in found.effects] == [('spot_clipping', 1)]
-    assert found.effects[0].active.values['radius'] == pytest.approx(2e-3, rel=0.02)
-
-
 def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     """Five values of 1000 sd among 4000 of dots: 5 (36 - 1) / 4000 of what an outlier counts; sums do not count."""
     table = np.zeros((6, 1000))
@@ -347,24 +196,6 @@ def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     # What is not there is no value.
     comparison.count[0][:, 500:] = 0.0
     assert excess(comparison, table) == pytest.approx((24.0 * 2000.0, 24.0))
-
-
-@pytest.mark.slow
-def test_the_only_torque_noted_twice_is_reported_with_the_clamp_that_twists() -> None:
-    """If the load were free, nothing would tell it from what the clamp does."""
-    levels = np.array(
-        [(0, 0, 0), (0, -20, 0), (15, 0, 0), (24, -40, 0), (20, -30, 17.5), (-15, 0, 0), (0, -35, 0), (0, 0, 0)]
-    )
-    acting = np.repeat(levels, DWELL, axis=0)
-    annotated = acting.copy()
-    annotated[4 * DWELL : 5 * DWELL] = (16, -20, 35)
-    clamp = {'effects__e__name': 'clamp_torsional_compliance', 'effects__e__compliance': 6e-6}
-    found = searched(read(acting, **clamp), annotated)
-    assert [(f.name, f.where, f.value) for f in found.setup] == [('load_value', 'load 4', (20.0, -30.0, 17.5))]
-    (effect,) = found.effects
-    assert 'clamp_torsional_compliance' in (effect.active.effect.name, *effect.equivalent)
-    assert found.verdict == 'effects_found'
-    assert found.law is None
 
 
 def test_free_times_are_settled_again_if_an_effect_fails() -> None:

@@ -79,21 +79,6 @@ def test_every_effect_imitates_itself() -> None:
     assert (matrix <= 1.0).all()
 
 
-def test_the_answer_for_people_and_programs() -> None:
-    found = answer()
-    first, *others = found.sentences()
-    named = sum(one.named is not None for one in found.effects)
-    assert first == (
-        f'Under thesis:1, 9 s, {named} of {len(found.effects) + len(found.hidden)} effects can be named, '
-        f'each from its own size on.'
-    )
-    assert any('mount_tilt from tip_force' in text for text in others)
-    tree = found.tree()
-    assert tree['effects'][0]['label'] == found.effects[0].label
-    assert 'bending_stiffness (moves_frequency 0)' in found.report()
-    assert found.files().keys() == {'report.html', 'isolable.json'}
-
-
 def test_loads_too_short_for_a_search_are_rejected() -> None:
     with pytest.raises(RecordingError, match='79 samples: discover needs at least 4 blocks'):
         isolable(RIG, LOADS[:79])

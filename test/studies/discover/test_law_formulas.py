@@ -40,58 +40,6 @@ def term_names(found: list[LawTerm]) -> dict[tuple[str, tuple[str, ...]], list[d
     return out
 
 
-def test_the_terms_that_are_tried_are_those_of_a_grid(observed: tuple[Workspace, Fit]) -> None:
-    (r,) = responses(*observed)
-    assert set(r.known) == set(variables_of(2))
-    # load_fx takes a few values, load_tz never changes, x1 many.
-    few = np.repeat([0.0, 5.0, -10.0, 1.0], 300)
-    ramp = np.linspace(-1e-3, 3e-3, 1200)
-    still = np.zeros(1200)
-    known = dict.fromkeys(variables_of(2), still) | {'load_fx': few, 'x1': ramp, 'time': np.arange(1200) * 1e-3}
-    got = term_names(list(terms([dataclasses.replace(r, known=known)])))
-    moving = ['load_fx', 'x1', 'time']
-    products: list[tuple[str, ...]] = [(a,) for a in moving]
-    products += [(a, b) for i, a in enumerate(moving) for b in moving[i:]]
-    products += [(a, a, a) for a in moving]
-    assert {of for form, of in got if form == 'product'} == set(products)
-    alone = [of for form, of in got if form not in ('product', 'relaxed', 'resonance')]
-    assert set(alone) == {('load_fx',), ('x1',)}
-
-    def numbers(form: str, name: str, shape: str) -> list[float]:
-        return [s[shape] for s in got[form, (name,)]]
-
-    for name, low, high in (('load_fx', -10.0, 5.0), ('x1', -1e-3, 3e-3)):
-        size = max(abs(low), abs(high))
-        eighths = [low + (high - low) * (k + 0.5) / 8 for k in range(8)]
-        for form in ('above', 'below'):
-            assert numbers(form, name, 'threshold') == pytest.approx(eighths)
-        for form in ('beyond', 'within'):
-            assert numbers(form, name, 'threshold') == pytest.approx([s * size for s in (0.05, 0.15, 0.3, 0.5, 0.7)])
-        assert numbers('play', name, 'half_width') == pytest.approx([0.02 * size, 0.1 * size, 0.3 * size])
-        taus = [0.02, 0.1, 0.3, 1.0, 3.0, 10.0]
-        assert numbers('relaxed', name, 'tau') == [s['tau'] for s in got['relaxed', (name, name)]] == taus
-    # Between the values that held loads take; else two dozen levels.
-    for form in ('over', 'under'):
-        assert numbers(form, 'load_fx', 'threshold') == [-5.0, 0.5, 3.0]
-        levels = [-1e-3 + 4e-3 * (k + 0.5) / 24 for k in range(24)]
-        assert numbers(form, 'x1', 'threshold') == pytest.approx(levels)
-    waves: Any = [(s['period'], s['phase']) for s in got['wave', ('x1',)]]
-    assert waves == [
-        (pytest.approx(share * 3e-3), phase)
-        for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
-        for phase in (0.0, math.pi / 2)
-    ]
-    rings: Any = [(s['natural_frequency'], s['zeta']) for s in got['resonance', ('load_fx',)]]
-    assert rings == [(pytest.approx(2.0 * 90.0 ** (k / 47)), 0.04) for k in range(48)]
-    # A load has no rate, a dot no direction.
-    only = {form: {of[0] for f, of in got if f == form} for form in ('rate', 'rate_absolute', 'drag', 'direction')}
-    assert only == {'rate': {'x1'}, 'rate_absolute': {'x1'}, 'drag': {'x1'}, 'direction': {'load_fx'}}
-    assert {form for form, _ in got} == {
-        *('product', 'absolute', 'signed_square', 'above', 'below', 'beyond', 'within', 'over', 'under', 'rate'),
-        *('rate_absolute', 'drag', 'direction', 'play', 'relaxed', 'wave', 'resonance'),
-    }
-
-
 def test_two_dozen_values_are_few_and_one_more_is_many(observed: tuple[Workspace, Fit]) -> None:
     (r,) = responses(*observed)
     for count in (24, 25):
@@ -548,25 +496,6 @@ def test_a_law_shows_alike_at_other_stages() -> None:
         assert moved.laws[0].terms[0].coefficient == pytest.approx(3e-6 / per)
         assert moved.laws[1] == law_of('dx')
     assert seeker.same_elsewhere(seeker.trial([law_of('load_fx', on='dx')], (), 1)) == []
-
-
-def test_a_shape_at_its_bound_is_not_the_right_form(observed: tuple[Workspace, Fit]) -> None:
-    workspace, fit = observed
-    before = workspace.simulations
-    seeker = laws.LawSearch(workspace, fit, 3.0)
-    assert seeker.tried == len(seeker.listed) * len(law_features.SOUGHT)
-    assert seeker.last == before + 600
-    got = seeker.trial([law_of('load_fy')], fit.effects, 2)
-    assert got.cost == pytest.approx(got.fit.chi2 + 3.0 * got.fit.parameters)
-    assert got.laws[0].terms[0].coefficient == got.fit.effects[-1].values['c1']
-    assert got.beside == got.fit.effects[:1]
-    bound = Law('b', 'psd', 'y2', (LawTerm('wave', ('x1',), shapes={'period': 1e-3, 'phase': 0.0}),))
-    full = refit(workspace, [*fit.effects, ActiveEffect(effect_of(bound), values_of(bound))], 0)
-    with pytest.MonkeyPatch.context() as patch:
-        for at, rejected in (((0, 'angle'), False), ((1, 'period1'), True)):
-            stopped = dataclasses.replace(full, at_bound=(at,))
-            patch.setattr(laws, 'refit', lambda *_, stopped=stopped: stopped)
-            assert math.isinf(seeker.trial([bound], fit.effects, 1).cost) == rejected
 
 
 @pytest.mark.parametrize('form', ['over', 'under'])

@@ -22,7 +22,6 @@ from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_te
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.conclusion import RigConclusion
-from psd_deflection.studies.discover.laws.law_features import responses, score, switchings, terms
 from psd_deflection.studies.discover.laws.laws import find_jitter, find_law
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
@@ -48,43 +47,11 @@ def workspace(law: Law | None, seed: int = 0, count: int = len(HISTORY)) -> Work
     return Workspace([Observation('test', RIG, samples.volts.T.copy(), history, warm)])
 
 
-def test_a_term_scores_to_first_order_what_it_explains() -> None:
-    law = Law('odd', 'link', 'static_dy', (LawTerm('product', ('load_fy', 'load_fy'), 2e-9),))
-    ws = workspace(law)
-    null = refit(ws, ())
-    found = responses(ws, null)
-    listed = list(terms(found))
-    assert len({(t.form, t.of, tuple(t.shapes.values())) for t in listed}) == len(listed)
-    best = score(found, listed)[0]
-    assert (best.target, best.term.form, best.term.of) == ('static_dy', 'product', ('load_fy', 'load_fy'))
-    assert best.term.coefficient == pytest.approx(2e-9, rel=0.02)
-    assert null.chi2 - best.gain == pytest.approx(ws.size, rel=0.05)
-
-
-def test_times_of_switching_are_found_to_a_sample_or_two() -> None:
-    for target, size in (('x1', 3e-6), ('static_dx', 5e-6)):
-        law = Law('bump', 'psd', target, (LawTerm('switched', (), size, times=(3.217, 7.5, 15.003)),))
-        ws = workspace(law)
-        found = responses(ws, refit(ws, ()))
-        best = score(found, switchings(found))[0]
-        assert best.target == target
-        assert best.term.coefficient == pytest.approx(size, rel=0.03)
-        np.testing.assert_allclose(best.term.times, (3.217, 7.5, 15.003), atol=0.004)
-
-
 def test_there_is_no_law_in_noise() -> None:
     ws = Workspace([make_observation(3)])
     null = refit(ws, ())
     assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print) is None
     assert find_jitter(ws, null, float(np.log(ws.effective_size()))) is None
-
-
-def test_noise_that_follows_a_variable_is_a_law_of_its_variance() -> None:
-    ws = workspace(Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),)))
-    found = find_jitter(ws, refit(ws, ()), float(np.log(ws.effective_size())))
-    assert found is not None
-    assert (found.law.acts_on, found.law.variables, found.law.kind) == ('y2', ('load_fy',), 'variance')
-    assert found.law.terms[0].coefficient == pytest.approx(5e-8, rel=0.1)
 
 
 @pytest.mark.slow

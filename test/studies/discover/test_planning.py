@@ -59,25 +59,6 @@ def plan(models: tuple[Workspace, Fit, Fit]) -> Plan:
 
 
 @pytest.mark.slow
-def test_another_length_is_planned_where_only_that_reports(plan: Plan) -> None:
-    assert plan.setting.changes == {'link.length': pytest.approx(0.7 * RIG.link.length, abs=1e-3)}
-    (reported,) = plan.discriminations
-    assert reported.alternative == 'clamp_bending_compliance'
-    assert reported.named.startswith('bending_stiffness')
-    assert min(reported.separation, reported.reverse) > SEPARATES
-    assert reported.possible >= max(reported.separation, reported.reverse)
-    assert plan.useful
-    assert plan.seconds <= 12.0
-    assert 'on a link of 0.41 m' in plan.sentence
-    # The script is what simulate --loads takes.
-    again = np.concatenate([load_history(s, plan.rate).loads for s in plan.script])
-    assert np.array_equal(again, plan.loads)
-    tree = json.loads(json.dumps(plan.tree(), allow_nan=False))
-    assert tree['overrides'] == plan.setting.changes
-    assert tree['rivals'][0]['separable']
-
-
-@pytest.mark.slow
 def test_it_is_reported_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
     workspace, named, alternative = models
     plan = plan_next(workspace, named, [alternative], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
@@ -201,15 +182,6 @@ class Searches:
         return loop.run_loop([first], self.search, lambda plan, number: made, most=most)
 
 
-def test_the_loop_ends_when_the_answer_is_unique(monkeypatch: pytest.MonkeyPatch) -> None:
-    searches = Searches(monkeypatch, 2)
-    done = searches.settle()
-    assert (done.outcome, len(done.plans), done.open) == ('unique', 2, None)
-    assert searches.observed == [1, 2, 3]
-    assert done.sentence == 'The answer is unique after 2 more recordings.'
-    assert Searches(monkeypatch, 0).settle().sentence == 'The answer is unique without a further recording.'
-
-
 def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     done = Searches(monkeypatch, 2, useful=False).settle()
     assert (done.outcome, len(done.plans)) == ('limits', 0)
@@ -299,14 +271,3 @@ def test_options_that_would_be_ignored_are_rejected(
 ) -> None:
     assert main(['discover', str(soft), '--out', str(tmp_path), '--quiet', *words]) == 2
     assert part in capsys.readouterr().err
-
-
-def test_a_plan_is_reported_in_words() -> None:
-    limits = Limits()
-    (push, *_) = pieces(RIG, limits)
-    plan = Plan(settings(RIG, limits)[1], (push, push), (), limits, 1000.0)
-    assert plan.words == f'{push.words}, 2 times, while the temperature swings by +-10 K'
-    assert plan.seconds == pytest.approx(27.0)
-    warm = plan.setting.temperature(9)
-    assert warm is not None
-    assert (warm.min(), warm.max()) == (10.0, 30.0)

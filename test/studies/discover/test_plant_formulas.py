@@ -89,41 +89,6 @@ def rms(values: FloatArray) -> float:
     return math.sqrt(sum(float(v) ** 2 for v in values) / len(values))
 
 
-def test_a_plant_is_measured_by_its_own_level() -> None:
-    observed = holed()
-    ws = PlantComparison(Pictures(observed, {}))
-    counts = [28, 22]
-    assert ws.total.tolist() == counts
-    assert (ws.size, ws.effective_size(), ws.simulations) == (50, 50.0, 1)
-    assert (ws.names, ws.channels, ws.periods) == (('a', 'b', 'c'), ('force', 'turn'), [1.0] * 3)
-    assert (ws.base, ws.nuisance, ws.open_level, ws.budget, ws.physics) == ((), (), True, 4000, None)
-    levels = [rms(full(observed, c)) for c in range(2)]
-    assert ws.level == pytest.approx(levels)
-    vector = ws.whiten(observed)
-    want = [np.nan_to_num(rows / np.array(levels)[:, None]).ravel() for rows in observed]
-    np.testing.assert_allclose(vector, np.concatenate(want), rtol=1e-12)
-    assert float(vector @ vector) == pytest.approx(50.0)
-    for part, rows in zip(ws.unwhitened(vector), observed, strict=True):
-        np.testing.assert_allclose(part, np.nan_to_num(rows), rtol=1e-12)
-    for part, rows in zip(ws.displayed(observed), observed, strict=True):
-        np.testing.assert_array_equal(part, rows)
-    # What is simulated where nothing was measured is not shown.
-    assert np.isnan(ws.displayed([np.zeros_like(rows) for rows in observed])[1][1]).all()
-    assert ws.provenance() == [
-        {'name': 'a', 'values': 18, 'lost': 2},
-        {'name': 'b', 'values': 7, 'lost': 7},
-        {'name': 'c', 'values': 25, 'lost': 1},
-    ]
-    own = [np.arange(n, dtype=np.float64) for n in LENGTHS]
-    there = [np.isfinite(rows[1]) for rows in observed]
-    np.testing.assert_allclose(
-        ws.row(1, own), np.concatenate([np.where(t, v, 0.0) for t, v in zip(there, own, strict=True)]) / levels[1]
-    )
-    residual, difference = ws.residual([])
-    np.testing.assert_allclose(residual, vector)
-    assert all(np.array_equal(d, rows, equal_nan=True) for d, rows in zip(difference, observed, strict=True))
-
-
 def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     observed = holed()
     left = [0.5 * rows for rows in observed]
@@ -300,26 +265,6 @@ def test_neighbours_that_follow_each_other_are_fewer_values() -> None:
     assert PlantComparison(Pictures(alone, {}, period=0.5)).independent.tolist() == [3.0, 3.0]
     # Each column a reading by itself: every one counts, however alike they are.
     assert PlantComparison(Pictures(slow, {})).independent.tolist() == [116.0, 180.0]
-
-
-@pytest.mark.parametrize('scale', [1.0, 1e-10])
-def test_a_level_is_the_same_within_two_per_cent(scale: float) -> None:
-    """In whatever unit; and it is another one if only its neighbours follow each other otherwise."""
-    rng = np.random.default_rng(3)
-    shown = [scale * rng.standard_normal((1, 40)) for _ in range(3)]
-    smooth = [np.cumsum(rows, axis=1) for rows in shown]
-    size = rms(full(shown, 0)) / rms(full(smooth, 0))
-    other = [rows - size * s for rows, s in zip(shown, smooth, strict=True)]
-    given = {'channels': ('force',), 'units': ('N',), 'period': 0.1}
-    for change, again in ((0.019, False), (0.021, True), (-0.019, False), (-0.021, True)):
-        ws = PlantComparison(Pictures(shown, {'a': shown, 'b': other}, **given))
-        again_observed = ws.renoised([on('a', change)])
-        assert (again_observed is not ws) == again
-        if again:
-            assert again_observed.level == pytest.approx(abs(1.0 - change) * ws.level)
-    followed = ws.renoised([on('b', 1.0)])
-    assert followed.level == pytest.approx(ws.level)
-    assert followed.independent[0] < 0.7 * ws.independent[0]
 
 
 def test_what_a_plant_simulates_is_what_the_model_says() -> None:

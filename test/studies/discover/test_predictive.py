@@ -97,6 +97,7 @@ def test_what_small_terms_do_together_is_reported_everywhere() -> None:
     assert 'small terms together' in found.files()['report.html']
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(2))
 def test_nothing_is_reported_to_remain_where_nothing_does(seed: int) -> None:
     found = psd_deflection.discover_in(Small(np.zeros(TERMS), 40, seed))

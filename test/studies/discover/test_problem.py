@@ -16,11 +16,10 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation
 from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_effect
 
-from .test_rules import A, B, Lone, Plant, active, candidate, noise, nowhere, pictures, without_noise
+from .test_rules import A, B, Lone, Plant, candidate, noise, nowhere, pictures, without_noise
 
 STEPS = (search, weigh, alternatives, where)
 
@@ -141,16 +140,3 @@ def test_the_gap_before_is_that_of_the_recording_as_it_was_stated() -> None:
     last = solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
     assert dataclasses.replace(last, stated_gap=7.0).gap_before == 7.0
     assert last.gap_before == last.bare.gap(last.null.difference)
-
-
-def test_a_comparison_does_not_change() -> None:
-    shown = pictures(A)
-    plant = Plant(shown, noise())
-    more = (active('a', x=0.1),)
-    other = plant.replaced(base=more, first=frozenset())
-    assert (plant.base, plant.first) == ((), FIRST)
-    assert (other.base, other.first) == (more, frozenset())
-    # What it costs is counted for all of them.
-    other.replaced(base=()).simulate(())
-    assert plant.simulations == other.simulations == 1
-    assert isinstance(other, Workspace)

@@ -204,17 +204,6 @@ def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: 
     assert 'discover and info take a table of readings without times' in capsys.readouterr().err
 
 
-def test_info_reports_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    readings = 1e3 * read([]).values
-    table = written(tmp_path / 'hung.csv', readings)
-    assert main(['info', str(table)]) == 0
-    text = capsys.readouterr().out
-    for part in ('a table of readings', '12, of 11 different loads', '-50 to 0 N', '0 of 48 are empty', 'temperature:'):
-        assert part in text
-    assert main(['info', str(table), '--json']) == 0
-    assert dict(json.loads(capsys.readouterr().out)['table'])['rows'] == '12, of 11 different loads'
-
-
 @pytest.mark.parametrize('rest', ['0', ''])
 def test_one_dial_gauge_is_searched_whether_other_columns_are_zero_or_empty(tmp_path: Path, rest: str) -> None:
     """Readings that are exactly as simulated are no measurement; nothing is held against them."""

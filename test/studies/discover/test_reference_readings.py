@@ -79,16 +79,6 @@ def test_a_reference_alone_names_what_the_link_lacks_though_loads_are_noted_late
 
 
 @pytest.mark.slow
-def test_nothing_is_named_if_nothing_is_missing(tmp_path: Path) -> None:
-    (table,) = read_tables([recorded(tmp_path / 'camera.mcap', [])])
-    assert (table.kind, len(table.loads)) == ('poses', len(LOADS))
-    np.testing.assert_array_equal(table.loads, LOADS)
-    assert table.temperature is not None
-    np.testing.assert_allclose(table.temperature, 21.5)
-    assert discover_in(ReadingsPlant([table])).verdict == 'nothing_missing'
-
-
-@pytest.mark.slow
 def test_a_table_with_times_gives_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     t, poses = measured([SOFT])
     annotated = np.searchsorted(HELD * np.arange(len(LOADS)) + np.array(LATE), t, side='right') - 1

@@ -465,54 +465,6 @@ def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tu
     assert bic == pytest.approx(loss + 3.0 * (len(names) - 1))
 
 
-@pytest.mark.parametrize(
-    ('gain', 'of_other', 'refitted'),
-    [
-        # Half of what the named effect explains; from 100 on all but 60 of it; from 150 on six tenths.
-        (80.0, 40.5, True),
-        (80.0, 39.5, False),
-        (120.0, 60.5, True),
-        (120.0, 59.5, False),
-        (200.0, 120.5, True),
-        (200.0, 119.5, False),
-    ],
-)
-def test_an_alternative_is_tried_if_it_explains_enough_of_the_same(
-    gain: float, of_other: float, refitted: bool
-) -> None:
-    shown = pictures(A, B)
-    a = shown[A] / np.linalg.norm(shown[A])
-    across = shown[B] - a * np.sum(a * shown[B])
-    share = of_other / gain
-    shown[B] = np.linalg.norm(shown[A]) * (
-        math.sqrt(share) * a + math.sqrt(1.0 - share) * across / np.linalg.norm(across)
-    )
-    plant = Plant(shown, without_noise((shown[A], gain)))
-    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b')]
-    search = Search(plant, lambda workspace, _: Screen(workspace, found))
-    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
-    others = search.alternatives(null, fit, 0, null.chi2 - fit.chi2)
-    assert [f.effects[-1].effect.name for f in others] == (['b'] if refitted else [])
-
-
-def test_a_search_adds_what_passes_and_nothing_else() -> None:
-    """Two of three effects act; from the residual of the first the second is found, and no third."""
-    shown = pictures(A, B, ('c', 'x'))
-    plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
-    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b', 'c')]
-    message: list[str] = []
-    result = ran(Search(plant, lambda workspace, _: Screen(workspace, found), message.append))
-    assert sorted(a.effect.name for a in result.fit.effects) == ['a', 'b']
-    assert message[:2] == ['adding a', 'adding b']
-    lost = {a.effect.name: g for a, g in zip(result.fit.effects, result.delta_chi2, strict=True)}
-    # Noise adds some tens: 2 sqrt(gain).
-    assert lost['a'] == pytest.approx(4000.0, abs=4 * 2 * math.sqrt(4000.0))
-    assert lost['b'] == pytest.approx(500.0, abs=4 * 2 * math.sqrt(500.0))
-    assert [s.candidate.effect.name for s in result.first_scores[:2]] == ['a', 'b']
-    quiet = ran(Search(Plant(shown, noise()), lambda workspace, _: Screen(workspace, found)))
-    assert quiet.fit.effects == ()
-
-
 @pytest.mark.parametrize(('remains', 'kept'), [(200.0, ['a', 'c']), (420.0, ['a', 'c']), (1000.0, ['c'])])
 def test_weak_effects_are_dropped_before_alternatives(remains: float, kept: list[str]) -> None:
     shown = pictures(A, B, ('c', 'x'))
@@ -729,25 +681,12 @@ def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bo
     assert unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 2.02e-6, 2e-6, 2.01e-6)
 
 
+@pytest.mark.slow
 def test_one_recording_of_a_thousand_has_a_larger_gap_from_noise_alone() -> None:
     rng = np.random.default_rng(7)
     plant = Plant({}, noise())
     above = [plant.gap([SIGMA * rng.standard_normal((6, FINE))]) > plant.noise_limit() for _ in range(4000)]
     assert 1 <= sum(above) <= 10
-
-
-def test_effects_weaker_than_the_unknown_remainder_are_taken_out() -> None:
-    shown = pictures(A, B)
-    search = search_of(Plant(shown, without_noise((shown[A], 5000.0), (shown[B], 150.0)) + noise()))
-    effects = [active('a', x=0.0), active('b', x=0.0)]
-    # An excess that chance explains is no unknown remainder.
-    for p, excess, kept in ((0.0, 140.0, ['a', 'b']), (0.0, 300.0, ['a']), (0.1, 300.0, ['a', 'b'])):
-        result = result_of(search, effects)
-        left = nowhere(p=p, excess=excess)
-        unheld = [HeldOut(1.0, 1.0)] * 2
-        after = credible(problem_of(search, result, unheld, left))
-        assert [a.effect.name for a in after.fit.effects] == kept
-        assert len(after.heldout) == len(kept) == len(after.result.delta_chi2)
 
 
 class Valleys(Plant):

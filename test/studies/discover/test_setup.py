@@ -104,16 +104,6 @@ def test_wiring_signs_and_units_are_put_right(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ('factor', 'unit'), [(9.80665e-3, 'kg mm'), (1e-2, 'N cm'), (9.80665e-2, 'kg cm')], ids=['kg mm', 'N cm', 'kg cm']
-)
-def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: str) -> None:
-    _, findings, _ = correct_wiring([loaded(recorded(), 1.0, 1.0, 1.0 / factor)], ())
-    assert [(f.name, f.where, f.value) for f in findings] == [('load_unit', 'tz', factor)]
-    assert f'it is noted in {unit} instead' in findings[0].fix
-
-
-@pytest.mark.slow
 def test_alike_units_differ_where_movement_is_nonlinear() -> None:
     """50 N at the end of a bar: what moves in proportion to the load is 1 % off, and the units are 2 % apart."""
     loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
@@ -122,12 +112,6 @@ def test_alike_units_differ_where_movement_is_nonlinear() -> None:
         annotated = np.asarray(loads / (1.0, 1.0, factor), dtype=np.float64)
         _, findings, _ = correct_wiring([Observation('x', RIG, volts, annotated)], ())
         assert [(f.where, f.value) for f in findings] == [('tz', factor)]
-
-
-@pytest.mark.slow
-def test_loads_in_grams_have_one_factor_for_forces_and_torque() -> None:
-    _, findings, _ = correct_wiring([loaded(recorded(), *[1.0 / 9.80665e-3] * 3)], ())
-    assert [(f.where, f.value) for f in findings] == [('fx fy', 9.80665e-3), ('tz', 9.80665e-3)]
 
 
 def test_a_soft_or_stiff_link_is_no_other_unit() -> None:
@@ -174,16 +158,6 @@ def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
 
 
 @pytest.mark.slow
-def test_late_loads_are_named_with_their_delay_and_the_end_is_left_out() -> None:
-    late = recorded()
-    late = dataclasses.replace(late, loads=np.concatenate((np.zeros((40, 3)), late.loads[:-40])))
-    found = found_in(late)
-    assert found.verdict == 'nothing_missing'
-    assert [f.name for f in found.setup] == ['load_delay']
-    assert found.setup[0].value == pytest.approx(0.040, abs=1e-4)
-
-
-@pytest.mark.slow
 def test_the_zero_of_one_of_two_recordings_is_named_with_its_recording() -> None:
     second = dataclasses.replace(recorded(seed=2), name='second')
     shift = np.array([0.3, -0.2, 0.0, 0.1, 0.4, 0.0])
@@ -226,37 +200,12 @@ def test_outliers_of_any_rate_and_size_are_left_out_and_movement_is_not(share: f
 
 
 @pytest.mark.slow
-def test_what_no_load_is_known_of_does_not_count() -> None:
-    """The first 1.5 s fall into a push; before the first known load it is not taken for zero."""
-    o = recorded()
-    unknown = o.loads.copy()
-    unknown[:1500] = 0.0
-    found = found_in(dataclasses.replace(o, loads=unknown, unknown_load=(1500, 0)))
-    assert found.verdict == 'nothing_missing'
-    assert [f.name for f in found.setup] == ['load_coverage']
-    assert found.floors < 1.1
-
-
-@pytest.mark.slow
 def test_a_recording_may_start_under_load_and_in_motion() -> None:
     o = recorded()
     cut = dataclasses.replace(o, volts=o.volts[1100:], loads=o.loads[1100:])
     found = found_in(cut)
     assert (found.verdict, found.setup) == ('nothing_missing', ())
     assert found.floors < 1.05
-
-
-@pytest.mark.slow
-def test_lost_samples_cost_precision_and_nothing_else() -> None:
-    o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
-    o.volts[np.random.default_rng(1).random(len(o.volts)) < 0.6] = np.nan
-    found = found_in(o)
-    assert found.setup == ()
-    (named,) = found.effects
-    assert named.active.effect.name == 'sensor_rotation'
-    assert abs(named.active.values['angle'] - 0.004) < 4.0 * named.sd['angle']
-    # A block counts from half of its samples on; of few blocks the gap is not exact.
-    assert found.floors < 1.2
 
 
 def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None = None) -> Path:

@@ -121,17 +121,6 @@ def test_a_cosine_is_weakened_by_the_root_of_the_density_at_its_frequency() -> N
     np.testing.assert_allclose(white, wave / np.sqrt(1.0 + 3.0 / f), rtol=1e-9, atol=1e-12)
 
 
-def test_slow_noise_is_white_after_whitening() -> None:
-    rows = flicker(6000, PERIOD, 5.0, 1).T
-    white = SlowNoise.of(np.full(6, 5.0), 6000, PERIOD).whiten(rows)
-    power = np.abs(np.fft.rfft(white, axis=1)) ** 2 / 6000
-    f = np.fft.rfftfreq(6000, PERIOD)
-    for low, high in ((0.1, 1.0), (1.0, 5.0), (5.0, 20.0), (20.0, 125.0)):
-        band = power[:, (f >= low) & (f < high)]
-        # Ripple of the sums of processes: 5 %.
-        assert band.mean() == pytest.approx(1.0, abs=0.07 + 4.0 / np.sqrt(band.size))
-
-
 @pytest.mark.parametrize('corner', [1.0, 10.0])
 def test_the_mean_of_a_block_is_as_uncertain_as_the_formula_says(corner: float) -> None:
     rows = np.concatenate([flicker(6000, PERIOD, corner, seed).T for seed in range(8)])

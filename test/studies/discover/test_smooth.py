@@ -76,11 +76,13 @@ def test_a_smooth_remainder_is_one_function_of_the_variable_that_it_follows() ->
     assert 'a smooth function of along' in found.report()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(6))
 def test_noise_alone_is_no_function(seed: int) -> None:
     assert smooth(Table(seed, 0.0)) is None
 
 
+@pytest.mark.slow
 def test_library_effects_and_stated_noise_are_no_remainder() -> None:
     assert psd_deflection.discover_in(Table(1, 0.0)).tree()['remainder'] is None
     quiet = Table(1, 1.0)
@@ -88,6 +90,7 @@ def test_library_effects_and_stated_noise_are_no_remainder() -> None:
     assert psd_deflection.discover_in(quiet).tree()['remainder'] is None
 
 
+@pytest.mark.slow
 def test_a_reading_is_predicted_without_itself() -> None:
     rng = np.random.default_rng(2)
     x = np.sort(rng.uniform(0.0, 1.0, 24))
@@ -122,6 +125,7 @@ def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     np.testing.assert_allclose(residual, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_gap_with_given_shapes_is_reported_beside_the_other() -> None:
     """It is smaller, for the shapes have seen the readings, and not below the noise."""
     found = smooth(Table(1, 1.0))

@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from types import SimpleNamespace
 from typing import Self, cast
 
 import numpy as np
@@ -20,15 +19,12 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.discover import planning
-from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Proposal, Setting
 from psd_deflection.studies.discover.search import search as steps
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
-from psd_deflection.studies.discover.search.localise import Dependence, dependences, localise, regressors
+from psd_deflection.studies.discover.search.localise import dependences, localise, regressors
 from psd_deflection.studies.discover.search.mistakes import mistake
-from psd_deflection.studies.discover.search.proposals import coarse_step
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
@@ -105,35 +101,6 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
     assert named(result.fit) == ['a', 'b']
 
 
-@pytest.mark.parametrize(('left', 'taken'), [(0.005, True), (0.02, False)])
-def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: bool) -> None:
-    """All but a hundredth of what is beyond noise. Beside an effect it is not looked for."""
-    shown = {('link_length', 'x'): pictures(A)[A], B: pictures(B, seed=4)[B]}
-    shown[B] = across(shown[B], shown['link_length', 'x'])
-    full = 100_000.0
-    plant = Plant(
-        shown, without_noise((shown['link_length', 'x'], full * (1 - left)), (shown[B], full * left)) + noise()
-    )
-    message: list[str] = []
-    search = searching(plant, shown, ['link_length', 'b'], message)
-    null = refit(plant, ())
-    scores = search.screen.score(null.residual)
-    first = mistake(search, null, scores)
-    assert named(first) == (['link_length'] if taken else [])
-    assert message == (['the set-up: link_length'] if taken else [])
-    if taken:
-        assert named(ran(searching(plant, shown, ['link_length', 'b'])).fit) == ['b', 'link_length']
-    # One that is weaker than the best by more than the third of it is not even tried.
-    weak = [
-        dataclasses.replace(s, gain=0.29 * scores[0].gain) if s.candidate.effect.name == 'link_length' else s
-        for s in scores
-    ]
-    best = dataclasses.replace(scores[0], candidate=candidate('b', 'x'))
-    assert mistake(search, null, [best, *weak[:1]]) is null
-    assert mistake(search, null, [dataclasses.replace(s, p=0.011) for s in scores]) is null
-    assert mistake(search, null, []) is null
-
-
 def test_another_sample_rate_is_tried_from_afar() -> None:
     """A linear step does not reach it; the rates of the list are starts of their own."""
     tried: list[float] = []
@@ -203,27 +170,6 @@ def test_an_effect_that_may_stand_in_is_not_added_and_that_is_reported() -> None
     assert (named(full.fit), full.limits) == (['a', 'b', 'c'], ())
 
 
-def test_a_model_of_two_effects_may_cost_twice_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = pictures(A, B, C)
-    plant = Plant(shown, without_noise(*((shown[n], 900.0) for n in (A, B, C))) + noise())
-    trace = ran(searching(plant, shown, 'abc')).trace
-    first, second, third = (int(line.split('[')[1].rstrip(']')) for line in trace if line.startswith('adding'))
-    budget = third // 2 + 1
-    assert first < budget <= second
-    plant.tally.count = 0
-    monkeypatch.setattr(plant, 'budget', budget)
-    assert named(ran(searching(plant, shown, 'abc')).fit) == ['a', 'b', 'c']
-
-
-def test_what_another_search_has_cost_ends_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = pictures(A)
-    plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
-    monkeypatch.setattr(plant, 'budget', 50)
-    search, null = searching(plant, shown, 'a'), refit(plant, ())
-    plant.tally.count += 1000
-    assert named(search.run(null)[1].fit) == ['a']
-
-
 def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:
     shown = pictures(A, B)
     shown[B] = across(shown[B], shown[A])
@@ -263,23 +209,6 @@ def test_the_better_of_two_alike_stays_the_other_is_listed() -> None:
     assert search.library_p(9.0, 1) == pytest.approx(1.0 - (1.0 - chi2_law.sf(9.0, 1)) ** 2)
     assert search.library_p(-1.0, 1) == 1.0
     assert search.penalty == pytest.approx(math.log(size * 4 / 20))
-
-
-def test_a_search_goes_on_with_other_noise() -> None:
-    shown = pictures(A)
-
-    class Louder(Plant):
-        def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
-            return self.replaced(noise=(dataclasses.replace(self.noise[0], innovation=1.5 * self.noise[0].innovation),))
-
-    plant = Louder(shown, without_noise((shown[A], 900.0)) + noise())
-    search = searching(plant, shown, 'a')
-    fit = refit(plant, [active('a', x=0.0)])
-    got = search.renoise(fit)
-    assert got.chi2 == pytest.approx(fit.chi2 / 1.5**2, rel=1e-6)
-    assert search.workspace is not plant
-    # The comparison that it began with has the noise that it had.
-    assert refit(plant, fit.effects).chi2 == pytest.approx(fit.chi2, rel=1e-9)
 
 
 EDGES = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
@@ -351,33 +280,6 @@ def test_the_chance_of_the_greatest_cell_is_that_of_noise(monkeypatch: pytest.Mo
     residual = noise(3).ravel() / SIGMA
     taken = residual - known[:, 0] * (known[:, 0] @ residual) / 50.0
     assert localise(plant, taken, known, np.random.default_rng(0)).p > 0.01
-
-
-def test_what_a_channel_follows_is_named_where_it_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two words at most for a channel, those of its strongest dependences; none from 25 Hz on."""
-    depends = [
-        Dependence('x2', 'load_fx^2', 90.0, 1e-9),
-        Dependence('x2', 'history of load_fx', 80.0, 1e-9),
-        Dependence('x2', 'dot_x', 70.0, 0.009),
-        Dependence('x2', 'time', 60.0, 1e-9),
-        Dependence('y1', 'time^2', 50.0, 0.01),
-    ]
-    monkeypatch.setattr('psd_deflection.studies.discover.search.localise.dependences', lambda *_: depends)
-    residual = noise(6) / SIGMA
-    t = np.arange(50) * 0.004
-    residual[3, 150:200] += 2.5 * np.sin(2 * np.pi * 20.0 * t) + 2.5 * np.sin(2 * np.pi * 80.0 * t)
-    residual[1, 150:200] += 2.5 * np.sin(2 * np.pi * 20.0 * t)
-    found = localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(1))
-    words = {(c.channel, c.band[0]): c.depends_on for c in found.cells if c.p < 0.01}
-    assert words[('x2', 17.0)] == ('load_fx', 'dot_position')
-    assert words[('x2', 60.0)] == ()
-    assert words[('y1', 17.0)] == ()
-    # Three tones of some hundred each; the strongest dependence counts if it is more.
-    assert found.excess > 400.0
-    depends[0] = Dependence('x2', 'load_fx^2', 5000.0, 1e-9)
-    assert localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(1)).excess == 5000.0
-    quiet = localise(Plant({}, noise()), noise(7).ravel() / SIGMA, None, np.random.default_rng(1))
-    assert quiet.p == pytest.approx(2e-9)
 
 
 def test_what_the_simulation_may_be_wrong_by_is_no_dependence() -> None:
@@ -464,38 +366,6 @@ def test_a_size_leaves_its_bound_for_however_little_it_gains(least: float, most:
         assert fit.at_bound == (() if inside > 0.0 else ((0, 'x'),))
 
 
-@pytest.mark.parametrize(
-    ('gain', 'short', 'again'), [(200.0, 59.0, True), (200.0, 61.0, False), (400.0, 79.0, True), (400.0, 81.0, False)]
-)
-def test_an_alternative_that_comes_close_is_refitted_in_full(
-    monkeypatch: pytest.MonkeyPatch, gain: float, short: float, again: bool
-) -> None:
-    """Short of the named effect by less than 60 in chi-square, or by a fifth of what that explains."""
-    shown = pictures(A, B)
-    share = 1.0 - short / gain
-    shown[B] *= np.linalg.norm(shown[A]) / np.linalg.norm(shown[B])
-    shown[B] = math.sqrt(share) * shown[A] + math.sqrt(1.0 - share) * across(shown[B], shown[A])
-    plant = Plant(shown, without_noise((shown[A], gain)))
-    search = searching(plant, shown, 'ab')
-    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
-    asked: list[int] = []
-
-    def counted(ws: Workspace, effects: Sequence[ActiveEffect], iterations: int = 8) -> Fit:
-        asked.append(iterations)
-        return refit(ws, effects, iterations)
-
-    monkeypatch.setattr(steps, 'refit', counted)
-    (other,) = search.alternatives(null, fit, 0, gain)
-    assert other.chi2 == pytest.approx(short, rel=1e-3)
-    assert asked == ([3, 8] if again else [3])
-    # After twice the budget none is refitted in full, and none is dropped without a word.
-    # A search that has used all its simulations but 1401 would take an hour.
-    search._begun = plant.simulations - 1401
-    asked.clear()
-    assert len(search.alternatives(null, fit, 0, gain)) == 1
-    assert asked == [3]
-
-
 def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> None:
     full = make_observation(warm=None)
     volts = full.volts.copy()
@@ -527,15 +397,6 @@ def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> 
     assert sizes == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
     assert left < 1e-3 * one.squared
     assert noise_energy([full, full]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
-
-
-@pytest.mark.parametrize(('values', 'observed'), [(4, True), (3, False)])
-def test_of_so_coarse_steps_four_values_are_enough(values: int, observed: bool) -> None:
-    """Each lies on them by a chance of a thousandth; three are too few however coarse they are."""
-    lsb = RIG.converter.volts_per_count
-    k = np.resize(np.arange(values) - 1.0, (2000, 6))
-    o = dataclasses.replace(make_observation(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
-    assert (coarse_step(o) is not None) == observed
 
 
 @pytest.mark.parametrize(('loss', 'is_alternative'), [(6.9, True), (7.1, False)])
@@ -581,33 +442,3 @@ def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
     assert (sizes < 0.0).any()
     assert reported < m.squared
     assert sign.evidence == pytest.approx((m.squared + energy) / (load_sizes(m, right)[0] + energy))
-
-
-@pytest.mark.parametrize(('efforts', 'taken'), [((0.0, 0.05), 'first'), ((0.05, 0.0), 'second'), ((0.0, 0.0), 'first')])
-def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
-    monkeypatch: pytest.MonkeyPatch, efforts: tuple[float, float], taken: str
-) -> None:
-    offered = [
-        Proposal(Setting(words, effort=effort), Piece('push', ('constant:0,-5,0:3',)))
-        for words, effort in zip(('first', 'second'), efforts, strict=True)
-    ]
-    apart = np.array([[0.0, 40.0], [30.0, 0.0]])
-    none = [[np.zeros(0)] * 2] * 2
-    monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
-    monkeypatch.setattr(planning, 'expected_sums', lambda *_: ModelSums(apart, none, [np.zeros((0, 0))] * 2, 3.0))
-    fits = [
-        cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'ab'
-    ]
-    ws = cast(Workspace, SimpleNamespace(observations=[make_observation(warm=None)]))
-    plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=6.0))
-    assert plan is not None
-    assert plan.setting.words == taken
-    (reported,) = plan.discriminations
-    # The same for as long as a recording may be shows twice as much.
-    assert (reported.alternative, reported.named, reported.separation, reported.reverse, reported.possible) == (
-        'b',
-        'a',
-        40.0,
-        30.0,
-        80.0,
-    )

@@ -13,25 +13,21 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.catalogue import catalogue, make_active
 from psd_deflection.model.simulation.effect_words import with_effects
-from psd_deflection.model.simulation.law_files import read_law
-from psd_deflection.model.simulation.laws import effect_of
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import channel_names, dot_names
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.from_recordings import read_observation, read_observations, read_tables
+from psd_deflection.studies.discover.from_recordings import read_tables
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.redundant import fourth, fourth_reading
 from psd_deflection.studies.discover.setup.setup import correct_wiring
-from psd_deflection.studies.discover.setup.slow_noise import corners_of
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
 
 TWO = load_rig()
@@ -68,35 +64,10 @@ def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: floa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('seed', [1, 2])
-def test_nothing_is_missing_where_nothing_is_hidden(seed: int) -> None:
-    found = discover([make_observation(RIG, seed=seed)])
-    assert (found.verdict, found.effects, found.setup) == ('nothing_missing', (), ())
-    assert 0.95 < found.floors < 1.05
-
-
-@pytest.mark.slow
 def test_of_six_psds_a_wrong_wiring_and_an_effect_are_named_together() -> None:
     found = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
     assert [(f.name, f.where) for f in found.setup] == [('channel_sign', 'x6')]
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 5)']
-
-
-@pytest.mark.slow
-def test_a_law_may_act_on_the_third_psd(tmp_path: Path) -> None:
-    """Beyond 12 N downwards the third detector lifts."""
-    plain = make_observation(RIG)
-    volts = plain.volts.copy()
-    volts[:, 7] += 0.004 * np.maximum(-LOADS[:, 1] - 12.0, 0.0)
-    found = discover([dataclasses.replace(plain, volts=volts)])
-    assert found.law is not None
-    assert found.law.law.acts_on == 'y3'
-    path = tmp_path / 'lifts.yaml'
-    path.write_text(
-        'name: lifts\nacts_on: sum3\nterms:\n  - {form: product, of: [x3], coefficient: 100.0}\n', encoding='utf-8'
-    )
-    effect = effect_of(read_law(path))
-    assert (effect.least_psds, effect_of(found.law.law).least_psds) == (3, 3)
 
 
 def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,15 +84,6 @@ def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: 
     assert make_active('lifts', {'c1': 1.0}, 'test').effect.least_psds == 4
 
 
-@pytest.mark.slow
-def test_hum_is_named_on_the_channels_of_the_third_psd() -> None:
-    hidden = 'mains_interference,frequency=50,amplitude_y3=0.004,amplitude_sum3=0.003,phase_sum3=1.0'
-    (effect,) = discover([make_observation(RIG, hidden)]).effects
-    assert effect.active.effect.name == 'mains_interference'
-    for name, size in (('amplitude_y3', 0.004), ('amplitude_sum3', 0.003), ('phase_sum3', 1.0), ('amplitude_x1', 0.0)):
-        assert effect.active.values[name] == pytest.approx(size, abs=4.0 * max(effect.sd[name], 1e-5))
-
-
 def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
     for psds in (2, 3, 6):
         names = [p.name for p in catalogue(psds)['mains_interference'].parameters]
@@ -135,23 +97,6 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
 
 
 # Wirings.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('world', 'reported'),
-    [
-        ({'psd_3.axes': ['-x', 'y']}, [('channel_sign', 'x3')]),
-        ({'psd_3.axes': ['y', 'x']}, [('axis_swap', 'psd_3')]),
-        ({'psds_exchanged': True, 'psd_3.axes': ['x', '-y']}, [('psd_swap', 'psd_1 psd_2'), ('channel_sign', 'y3')]),
-    ],
-)
-def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], reported: list[tuple[str, str]]) -> None:
-    given = make_observation(RIG, world=world)
-    (right,), findings, lines = correct_wiring([given], ())
-    assert [(f.name, f.where) for f in findings] == reported
-    assert lines == world
-    assert right.volts == pytest.approx(Wiring.from_rig(replace_values(RIG, world)).to_psds(given.volts))
 
 
 @pytest.mark.slow
@@ -274,24 +219,6 @@ def test_the_readings_too_many_acquit_the_detectors_of_what_the_link_does(word: 
     assert reading.acquits == acquitted
 
 
-def test_slow_noise_is_observed_if_all_lights_and_all_dots_but_one_have_it() -> None:
-    """1/f noise of a corner of 4 Hz, of nine channels."""
-    rng, n, period = np.random.default_rng(3), 4000, 0.004
-    f = np.fft.rfftfreq(n, period)
-    f[0] = f[1]
-    spectrum = np.fft.rfft(rng.standard_normal((9, n)))
-    pink = np.fft.irfft(spectrum * np.sqrt(1.0 + 4.0 / f), n)
-    found = corners_of([pink], [period])
-    assert found.shape == (9,)
-    assert np.all((found > 2.0) & (found < 8.0))
-    white = rng.standard_normal((9, n))
-    for without in ((8,), (0, 6), (0, 1, 3, 4)):
-        rows = pink.copy()
-        rows[list(without)] = white[list(without)]
-        assert not corners_of([rows], [period]).any()
-    assert not corners_of([white], [period]).any()
-
-
 # Files.
 
 
@@ -306,28 +233,6 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
 def test_volts_of_another_number_of_psds_than_the_rig_has_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
         Observation('x', SIX, make_observation(RIG).volts, LOADS)
-
-
-@pytest.mark.slow
-def test_the_command_searches_a_recording_of_three_and_writes_what_it_found(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    psd_3:\n      center: [0.080, -0.060]\n', encoding='utf-8')
-    steps = 'steps:0,0,0;0,-20,0;0,0,0;15,-10,4;0,0,0;0,-10,-6;0,0,0:1'
-    words = ['--params-file', str(rig), '--loads', steps, '--effect', 'sensor_rotation,psd=3,angle=0.01']
-    assert main(['simulate', *words, '--out', str(tmp_path / 'three.csv')]) == 0
-    assert main(['simulate', '--loads', steps, '--out', str(tmp_path / 'two.csv')]) == 0
-    observed = read_observation(tmp_path / 'three.csv', RIG)
-    assert (observed.psds, observed.volts.shape) == (3, (7000, 9))
-    out = tmp_path / 'out'
-    assert main(['discover', str(tmp_path / 'three.csv'), '--params-file', str(rig), '--out', str(out)]) == 0
-    assert 'sensor_rotation (psd 3) is missing' in capsys.readouterr().out
-    assert 'psd: 3' in (out / 'model.yaml').read_text(encoding='utf-8')
-    page = (out / 'report.html').read_text(encoding='utf-8')
-    assert all(name in page for name in channel_names(3))
-    with pytest.raises(ConfigError, match=r'two.csv: has samples of 2 PSDs, the rig file has 3'):
-        read_observations([tmp_path / 'three.csv', tmp_path / 'two.csv'], RIG)
 
 
 @pytest.mark.slow

@@ -67,13 +67,6 @@ def test_an_effect_beside_such_a_zero_is_named_alone() -> None:
     assert found.verdict == 'effects_found'
 
 
-@pytest.mark.slow
-def test_the_free_zero_costs_no_simulation_and_no_turn_of_settling(faultless: Discovery) -> None:
-    same = recorded(taken=True)
-    exact = replace(same, rig=RIG, zero_variances=())
-    assert faultless.simulations == discover([exact]).simulations
-
-
 def test_a_constant_is_whitened_by_what_the_zero_allows() -> None:
     """One standard deviation of a well seen constant leaves a residual of about one standard deviation of noise."""
     o = recorded(taken=True)

@@ -13,7 +13,7 @@ import pytest
 from psd_deflection.arms.shapers import recommended, shaper
 from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.result import Identified, interval_words
+from psd_deflection.studies.identify.result import Identified
 
 
 def mode(frequency: float = 14.0, damping: float = 0.02, *, sd: float = 1e-4, damping_sd: float = 1e-4) -> Mode:
@@ -100,24 +100,6 @@ def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str
     assert answer.shaper_of(2) is None
 
 
-@pytest.mark.parametrize(
-    ('value', 'sd', 'words'),
-    [
-        (14.0, 0.01, '14.000 ± 0.020'),
-        (14.0, 0.1, '14.00 ± 0.20'),
-        (14.0, 1.0, '14.0 ± 2.0'),
-        (140.0, 10.0, '140 ± 20'),
-        (1400.0, 100.0, '1400 ± 196'),
-        (0.02, 0.00123, '0.0200 ± 0.0024'),
-        (1.0, 1e-12, '1.000000000 ± 0.000000000'),
-        (14.0, 0.0, '14.000000 ± 0.000000'),
-        (14.0, math.inf, '14.000000 ± inf'),
-    ],
-)
-def test_an_interval_has_two_digits(value: float, sd: float, words: str) -> None:
-    assert interval_words(value, sd) == words
-
-
 def test_a_mode_in_words() -> None:
     x = Mode(14.0, 0.01, 0.02, 0.001, 12.34e-6)
     twist = Mode(21.0, 0.02, 0.03, 0.001, math.radians(0.0125))
@@ -141,13 +123,6 @@ def test_a_mode_in_words() -> None:
     # The shaper stands beside the loudest mode only.
     assert [row[-1] == '' for row in rows] == [False, True, True, False]
     assert rows[2] == ['ΔY', 'none: knock on the link, or release a load', '', '', '', '']
-
-
-def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
-    """ZVD of 0.5 Hz without damping: a quarter, a half and a quarter, half a turn apart."""
-    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ()).shaper_words(0)
-    assert words == 'ZVD: 0.2500 at 0.0 ms, 0.5000 at 1000.0 ms, 0.2500 at 2000.0 ms'
-    assert found((), (), ()).shaper_words(0) == ''
 
 
 def test_numbers_for_machines_are_in_si_units() -> None:

@@ -4,14 +4,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from blind.modes import CASES, RATE, Link, bound, driven, noise, rung, scored
-from psd_deflection.records import FloatArray
+from blind.modes import CASES, RATE, Link, driven, noise, rung, scored
 from psd_deflection.studies.identify.modes import modes_of
 
 
@@ -31,6 +28,7 @@ def test_intervals_hold_the_truth(name: str, frequency_off: float, damping_off: 
     assert damping >= 9
 
 
+@pytest.mark.slow
 def test_one_weight_hung_on_and_off_rings_as_well() -> None:
     """The windows that hold a blow swing most; there are more of them than would be tried."""
     samples = rung(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(4), 14.0, 6, equal=True)
@@ -41,6 +39,7 @@ def test_one_weight_hung_on_and_off_rings_as_well() -> None:
     assert abs(mode.damping - 0.02) < 4.0 * mode.damping_sd < 0.03 * 0.02
 
 
+@pytest.mark.slow
 def test_two_modes_that_beat_are_two() -> None:
     """Bending planes turned against the axes: both show on each."""
     second, damping = 14.3, 0.01
@@ -53,6 +52,7 @@ def test_two_modes_that_beat_are_two() -> None:
         assert abs(mode.damping - damping) < 4.0 * mode.damping_sd < 0.03 * damping
 
 
+@pytest.mark.slow
 def test_noise_that_remembers_widens_the_interval_and_moves_nothing() -> None:
     link = Link(((14.0, 0.02, 1.0),), noise=20e-6, memory=0.9)
     modes = [modes_of(rung(link, np.random.default_rng(seed)), RATE) for seed in range(2)]
@@ -89,6 +89,7 @@ def test_a_step_response_of_scipy() -> None:
     assert any(3.0 <= s < 3.1 for s in starts)
 
 
+@pytest.mark.slow
 def test_a_second_mode_is_found_and_separated() -> None:
     link = Link(((14.0, 0.02, 0.9), (46.0, 0.01, 0.1)))
     found = modes_of(rung(link, np.random.default_rng(1)), RATE)
@@ -99,6 +100,7 @@ def test_a_second_mode_is_found_and_separated() -> None:
     assert first.amplitude > 5.0 * second.amplitude
 
 
+@pytest.mark.slow
 def test_one_mode_is_not_made_two() -> None:
     for seed in range(2):
         assert len(modes_of(rung(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(seed)), RATE).modes) == 1
@@ -129,20 +131,3 @@ def test_noise_has_no_mode() -> None:
         found = modes_of(np.random.default_rng(seed).normal(0.0, 2e-6, 5000), RATE)
         assert found.modes == ()
         assert found.how == 'none'
-
-
-def test_the_bound_of_a_record_is_that_of_its_spectrum() -> None:
-    """By differences of the logarithm on an even grid."""
-    hertz, zeta, seconds = 14.0, 0.02, 60.0
-    f = np.arange(1, 120_000) / 240.0
-
-    def log_spectrum(p: FloatArray) -> FloatArray:
-        x = (f / hertz) ** 2 * math.exp(-2.0 * p[0])
-        sharp = 4.0 * (zeta * math.exp(p[1])) ** 2 * x
-        mode = 4e-8 * 4.0 * zeta / (math.pi * hertz) * math.exp(p[2]) / ((1.0 - x) ** 2 + sharp)
-        return np.asarray(np.log(mode + 4e-12 / 500.0 * math.exp(p[3])))
-
-    slopes = np.stack([(log_spectrum(1e-5 * e) - log_spectrum(-1e-5 * e)) / 2e-5 for e in np.eye(4)])
-    information = seconds * (slopes @ slopes.T) / 240.0
-    expected = np.sqrt(np.linalg.inv(information).diagonal())[:2]
-    np.testing.assert_allclose(bound(Link(((hertz, zeta, 1.0),)), seconds), expected, rtol=2e-3)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +12,10 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.signal.windows import hann
-from scipy.stats import gamma
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import operation
-from psd_deflection.studies.identify.operation import information_of, mode_in_operation, scatters_as_exponential
+from psd_deflection.studies.identify.operation import mode_in_operation, scatters_as_exponential
 
 RATE = 200.0
 
@@ -46,6 +44,7 @@ def lines(samples: FloatArray, frequency: float) -> tuple[FloatArray, FloatArray
     return f[about], p[about]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('prior', 'guess'), [(None, 14.0), (0.2, 14.5)])
 def test_it_is_the_likeliest_mode_with_the_scatter_of_its_likelihood(
     prior: float | None, guess: float, monkeypatch: pytest.MonkeyPatch
@@ -118,30 +117,6 @@ def test_a_spectrum_of_thirty_lines_is_enough(seconds: float, observed: bool) ->
     assert (mode_in_operation(samples, RATE, 14.0) is not None) is observed
 
 
-def test_the_search_begins_at_the_peak_with_narrow_and_wide_modes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three tenths of the highest line at the peak of a mode alone, and a tenth of the median below it."""
-    samples = driven(noise=3e-5)
-    p = lines(samples, 14.3)[1]
-    starts: list[FloatArray] = []
-
-    def watched(loss: Any, start: FloatArray, **options: Any) -> Any:
-        starts.append(start)
-        found = minimize(loss, start, **options)
-        assert found.success
-        return found
-
-    monkeypatch.setattr(operation, 'minimize', watched)
-    assert mode_in_operation(samples, RATE, 14.3) is not None
-    found = [(*np.exp(start[:4]), start[4]) for start in starts]
-    # A mode alone has the height a / (2 zeta f0^2)^2.
-    heights = [a / (2.0 * zeta * f0**2) ** 2 / p.max() for a, f0, zeta, *_ in found]
-    np.testing.assert_allclose(heights, 0.3, rtol=1e-9)
-    np.testing.assert_allclose([row[1] for row in found], 14.3)
-    np.testing.assert_allclose([row[2] for row in found], [0.005, 0.02, 0.08])
-    np.testing.assert_allclose([row[3] for row in found], 0.1 * np.median(p))
-    assert [row[4] for row in found] == [0.0] * 3
-
-
 def test_a_steady_swing_is_no_driven_mode() -> None:
     """Nor are two modes one."""
     t = np.arange(6000) / RATE
@@ -150,43 +125,8 @@ def test_a_steady_swing_is_no_driven_mode() -> None:
     assert mode_in_operation(driven() + driven(17.0, 0.01, seed=2) + noise, RATE, 14.0) is None
 
 
-def swollen(n: int, first: int, count: int, total: float) -> FloatArray:
-    """Ratios of 1, but ``count`` of them from ``first`` have the sum ``total``."""
-    out = np.ones(n)
-    out[first : first + count] = total / count
-    return out
-
-
-@pytest.mark.parametrize(
-    ('n', 'first', 'count', 'parts'),
-    [
-        # Fours of thirty-two; two of them lie in either neighbour of the larger parts.
-        (32, 4, 4, 8),
-        # Thirty have six fives, and sevenths that begin elsewhere.
-        (30, 15, 5, 6),
-        # Eighths of eighty.
-        (80, 30, 10, 8),
-    ],
-)
-def test_a_spectrum_leaves_the_line_once_in_two_thousand_parts(n: int, first: int, count: int, parts: int) -> None:
-    """A sum of exponential ratios has a gamma distribution; too much and too little count, in each of the parts."""
-    for factor, expected in ((0.98, False), (1.02, True)):
-        chance = factor * 0.0005 / (2.0 * parts)
-        for total in (gamma.isf(chance, count), gamma.ppf(chance, count)):
-            assert scatters_as_exponential(swollen(n, first, count, total)) is expected
-
-
 def test_ratios_as_they_should_be_pass() -> None:
     rng = np.random.default_rng(6)
     assert sum(scatters_as_exponential(rng.exponential(size=200)) for _ in range(40)) >= 39
     assert not scatters_as_exponential(1.5 * rng.exponential(size=1000))
     assert not scatters_as_exponential(np.ones(1000) + 1e-3 * rng.normal(size=1000) + 0.8)
-
-
-def test_the_information_is_of_the_slopes_of_the_logarithm() -> None:
-    """Of exp(a^3 f + sin(b) f^2): slopes 3 a^2 f and cos(b) f^2."""
-    f = np.linspace(1.0, 2.0, 7)
-    a, b = 0.7, 0.4
-    slopes = np.stack((3.0 * a**2 * f, math.cos(b) * f**2))
-    found = information_of(lambda x: np.asarray(np.exp(x[0] ** 3 * f + math.sin(x[1]) * f**2)), np.array([a, b]))
-    np.testing.assert_allclose(found, slopes @ slopes.T, rtol=1e-7)

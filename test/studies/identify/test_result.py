@@ -45,26 +45,6 @@ def test_modes_known_well_reach_the_rig_file(source: Opened) -> None:
     assert not any('Nothing for' in line for line in answer.lines())
 
 
-@pytest.mark.parametrize(
-    ('x', 'y', 'why'),
-    [
-        ((mode(14.0), mode(14.7)), (mode(14.0),), 'two modes close to each other'),
-        ((mode(14.0),), (mode(14.7),), 'different frequencies'),
-        ((mode(14.0, 0.0033, damping_sd=0.0016),), (), 'not known well enough'),
-        ((), (mode(14.0, sd=0.2),), 'not known well enough'),
-    ],
-)
-def test_doubtful_modes_do_not(source: Opened, x: tuple[Mode, ...], y: tuple[Mode, ...], why: str) -> None:
-    answer = found(source, x, y, (mode(21.0),))
-    assert set(answer.values) == {'dynamics.torsion_frequency', 'dynamics.torsion_damping_ratio'}
-    (message,) = [line for line in answer.sentences() if 'Nothing for' in line]
-    assert message.startswith('Nothing for dynamics.bending_*: ')
-    assert why in message
-    text = answer.rig_yaml()
-    assert 'torsion_frequency: 21.0' in text
-    assert 'bending_frequency: 14.0' in found(source, (mode(14.0),), (), ()).rig_yaml()
-
-
 def test_a_damping_ratio_that_may_be_anything_has_no_shaper(source: Opened) -> None:
     answer = found(source, (mode(14.0, 0.02, damping_sd=0.01),), (), ())
     assert answer.shaper_of(0) is None

@@ -5,14 +5,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.optimize import brentq, nnls
 from scipy.signal import lfilter, welch
-from scipy.signal.windows import blackmanharris
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify.spectra import (
@@ -72,24 +69,6 @@ def test_a_peak_is_25_times_the_noise(frequency: float, rate: float) -> None:
         assert loudest_peak(samples, rate, noise) == expected
 
 
-@pytest.mark.parametrize(('beside', 'least'), [((), 4.0), ((30.0,), 30.0), ((90.0, 30.0), 30.0)])
-def test_a_peak_stands_out_of_what_is_around_it(beside: tuple[float, ...], least: float) -> None:
-    """The median between a fifth and a half of its frequency away; a blunt step has more below it than above."""
-    around = np.asarray(lfilter([0.3], [1.0, -0.7], np.repeat([0.0, 1.0], 10_000)))
-
-    def stands_out(size: float) -> float:
-        f, p = of_differences(sine(60.0) + size * around)
-        away = np.abs(f / 60.0 - 1.0)
-        return float(p[f == 60.0][0] / np.median(p[(away > 0.2) & (away < 0.5)]))
-
-    def missing(log_size: float, wanted: float) -> float:
-        return math.log(stands_out(math.exp(log_size)) / wanted)
-
-    for factor, expected in ((0.99, None), (1.01, 60.0)):
-        size = math.exp(brentq(missing, math.log(1e-5), math.log(10.0), args=(factor * least,)))
-        assert loudest_peak(sine(60.0) + size * around, RATE, 1e-9, beside) == expected
-
-
 def test_a_further_peak_is_not_at_one_that_is_taken() -> None:
     """Not within 15 % of its frequency, nor within two lines of the spectrum, an eighth of a hertz each."""
     assert loudest_peak(sine(22.875), RATE, 1e-9, [20.0]) is None
@@ -146,51 +125,3 @@ def test_a_mode_exceeds_the_noise_at_its_frequency_25_times(frequency: float) ->
         half = 0.5 * top / factor / (RATE**2 * abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2)
         noise = ColouredNoise(half, half * float(abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2))
         assert exceeds_noise(samples, RATE, frequency, noise) is expected
-
-
-def fitted_bands(samples: FloatArray, peaks: list[float], monkeypatch: pytest.MonkeyPatch) -> list[FloatArray]:
-    """What is given to the fit of the noise, if there is a fit: shapes over the power of each band."""
-    observed: list[FloatArray] = []
-
-    def watched(matrix: FloatArray, ones: FloatArray) -> Any:
-        np.testing.assert_array_equal(ones, 1.0)
-        observed.append(matrix)
-        return nnls(matrix, ones)
-
-    monkeypatch.setattr('scipy.optimize.nnls', watched)
-    found = coloured_noise(samples, RATE, peaks)
-    assert found.white > 0.0 or not samples.any()
-    return observed
-
-
-@pytest.mark.parametrize('peaks', [[14.0], [46.0, 14.0], [60.0]])
-def test_the_noise_is_fitted_in_24_bands_above_the_loudest_mode(
-    peaks: list[float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From 2.5 times its frequency to 0.48 of the sample rate, not within 40 % of a mode; in quiet times."""
-    samples = np.random.default_rng(11).normal(0.0, 2e-6, 7_123)
-    length = max(64, round(4.0 * RATE / min(peaks)))
-    window = blackmanharris(length, sym=False)
-    pieces = np.lib.stride_tricks.sliding_window_view(samples, length)[:: length - length // 2]
-    rotated = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 * 2.0 / (RATE * np.sum(window**2))
-    # A quarter of the squares of noise lie below -log(0.75) of their mean.
-    p = np.quantile(rotated, 0.25, axis=0) / math.log(4.0 / 3.0)
-    f = np.arange(len(p)) * RATE / length
-    shapes = [np.ones(len(f)), 1.0 / np.maximum(np.abs(1.0 - np.exp(-2j * np.pi * f / RATE)) ** 2, 1e-9)]
-    # A mode of quality 10.
-    shapes += [1.0 / ((1.0 - (f / k) ** 2) ** 2 + 0.01) for k in peaks]
-    lowest, highest = 2.5 * peaks[0], 0.48 * RATE
-    band = np.floor(24.0 * np.log(np.maximum(f, 1e-9) / lowest) / math.log(highest / lowest))
-    band[np.any([np.abs(f / k - 1.0) <= 0.4 for k in peaks], axis=0)] = -1
-    rows = [[shape[band == b].mean() / p[band == b].mean() for shape in shapes] for b in range(24) if (band == b).any()]
-    (observed,) = fitted_bands(samples, peaks, monkeypatch)
-    expected = np.array(rows) / np.linalg.norm(rows, axis=0)
-    np.testing.assert_allclose(observed, expected, rtol=1e-9)
-
-
-def test_a_fit_of_the_noise_needs_four_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows of 64 samples have a line each 15.6 Hz; four of them lie above 415 Hz, three above 430 Hz."""
-    samples = np.random.default_rng(12).normal(0.0, 2e-6, 5_000)
-    assert len(fitted_bands(samples, [166.0], monkeypatch)) == 1
-    assert fitted_bands(samples, [172.0], monkeypatch) == []
-    assert fitted_bands(np.zeros(5_000), [14.0], monkeypatch) == []

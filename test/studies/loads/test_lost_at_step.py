@@ -10,7 +10,6 @@ import pytest
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.annotated_times import correct_loads
 
 RIG = load_rig()
@@ -35,6 +34,7 @@ def reported(dots: FloatArray) -> list[float]:
     return [note.delay for note in corrected.timed]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('lost', 'share'), [(80, 0.98), (150, 0.5), (450, 0.02), (1500, 0.5)])
 def test_a_time_is_found_among_lost_samples_by_the_ringing_after_them(lost: int, share: float) -> None:
     dots = DOTS.copy()
@@ -50,6 +50,7 @@ def test_samples_lost_between_the_steps_change_no_time() -> None:
     assert reported(dots) == pytest.approx(LATE, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_equal_delays_after_lost_samples_are_corrected() -> None:
     """Rows of a CSV have the load: after a loss it seems to begin late."""
     dots, after = DOTS.copy(), APPLIED.copy()
@@ -60,18 +61,3 @@ def test_equal_delays_after_lost_samples_are_corrected() -> None:
     assert corrected is not None
     assert [note.delay for note in corrected.notes] == pytest.approx([0.2] * 5, abs=2e-3)
     assert correct_loads(RIG, dots, APPLIED) is None
-
-
-def test_a_step_among_lost_samples_is_in_their_middle() -> None:
-    dots = np.zeros((400, 4))
-    dots[200:, 2] = 3.0
-    # A quarter of the width is not yet a loss.
-    for lost, message in ((10, 0), (11, 11), (60, 60)):
-        part = dots.copy()
-        part[200 - lost // 2 : 200 - lost // 2 + lost] = np.nan
-        (step,) = steps_module.lasting_steps(part, 40)
-        assert step.lost == message
-        assert step.size == pytest.approx(3.0)
-        assert step.at == pytest.approx(200.0, abs=1.5 if message else 7.0)
-        assert step.first < 200 - lost // 2
-        assert step.last > 200 + lost // 2

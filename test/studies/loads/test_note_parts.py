@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.annotated_times import (
-    ALIKE_S,
     CorrectedNote,
     ordinal,
     shifted,
@@ -26,31 +24,6 @@ def note(
     annotated: float, applied: float, took: float = 0.0, *, rest_only: bool = False, number: int = 3
 ) -> CorrectedNote:
     return CorrectedNote(number, (1.5, -2.0, 0.25), annotated, applied, took, rest_only)
-
-
-@pytest.mark.parametrize(
-    ('one', 'name', 'value', 'size', 'wrong'),
-    [
-        (note(3.0, 1.0), 'load_time', 2.0, 2.0, True),
-        (note(1.0, 3.0), 'load_time', -2.0, 2.0, True),
-        (note(3.0, 1.0, 1.75), 'load_time', 2.0, 2.0, True),
-        # As late as it took: noted when it was done.
-        (note(3.0, 1.0, 2.0), 'load_ramp', 2.0, 2.0, True),
-        (note(1.0, 3.0, 2.0), 'load_ramp', 2.0, 2.0, True),
-        (note(1.0, 3.0, 2.5), 'load_ramp', 2.5, 2.0, True),
-        (note(1.0, 1.0, 0.5), 'load_ramp', 0.5, 0.0, True),
-        # Two milliseconds are no delay.
-        (note(ALIKE_S, 0.0), 'load_ramp', 0.0, ALIKE_S, False),
-        (note(0.0, ALIKE_S), 'load_ramp', 0.0, ALIKE_S, False),
-        (note(0.0021, 0.0), 'load_time', 0.0021, 0.0021, True),
-    ],
-)
-def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
-    one: CorrectedNote, name: str, value: float, size: float, wrong: bool
-) -> None:
-    assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
-    assert one.where == 'load 3'
-    assert CorrectedNote(3, one.load, one.annotated, one.applied, one.took) == one
 
 
 @pytest.mark.parametrize(
@@ -83,41 +56,6 @@ def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
     assert [ordinal(n) for n in range(1, 1001)] == [f'{n}{ending(n)}' for n in range(1, 1001)]
 
 
-@pytest.mark.parametrize(
-    ('late', 'alike'),
-    [
-        ([0.25, 0.25, 0.25], True),
-        ([0.25, 0.375, 0.125], True),
-        ([0.25, 0.376, 0.125], False),
-        ([0.25, 0.374, 0.124], False),
-        ([-0.25, -0.375, -0.125], True),
-        ([0.9, 0.9, 0.9], True),
-        ([0.901, 0.901, 0.9], False),
-        ([-0.901, -0.901, -0.9], False),
-        # The middle one counts, not the mean.
-        ([0.25, 0.25, 0.0, 0.25], False),
-    ],
-)
-def test_equal_delays_are_near_the_median_and_below_0_9_s(late: list[float], alike: bool) -> None:
-    assert annotated_times.are_alike(np.array(late), 0.125) is alike
-
-
-def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
-    rig = load_rig(overrides={'psd_1.zero': [0.002, -0.01], 'psd_2.zero': [0.01, 0.004]})
-    link = rig.link
-    fourth = link.outer_radius**4 - link.inner_radius**4
-    bend = link.length**3 / (3.0 * link.youngs_modulus * math.pi / 4.0 * fourth)
-    twist = link.length / (link.shear_modulus * math.pi / 2.0 * fourth)
-    beams = ((0.002, 0.06), (-0.09, 0.004))
-    loads = [(2.0, 0.0, 0.0), (0.0, -3.0, 0.0), (1.0, 2.0, -4.0)]
-    wanted = []
-    for fx, fy, tz in loads:
-        x, y, turn = bend * fx, bend * fy, twist * tz
-        moved = [(-x + turn * ly, -y - turn * lx) for lx, ly in beams]
-        wanted.append(math.sqrt(sum(a * a + b * b for a, b in moved)))
-    assert annotated_times.expected_movements(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
-
-
 # ---- steps of the dots
 
 
@@ -137,41 +75,6 @@ def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
         enough = min(len(before), len(after)) > width // 4
         out[at] = float(np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))) if enough else 0.0
     return out
-
-
-def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
-    # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
-    (step,) = steps_module.steps_among_samples(stepped(200, {100: 2.0}), 10)
-    assert (step.at, step.size) == pytest.approx((100.0, 2.0))
-    assert (step.first, step.last) == (91, 110)
-    # Of two rows of three the middle is between them.
-    (slow,) = steps_module.steps_among_samples(stepped(200, {100: 1.0, 101: 1.0}), 10)
-    assert slow.at == pytest.approx(100.5)
-    # So it is wherever the dots are, from the first width of them on.
-    early = stepped(200, {14: 1.0})
-    (first,), (shifted,) = (
-        steps_module.steps_among_samples(early, 10),
-        steps_module.steps_among_samples(early + 5.0, 10),
-    )
-    assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
-    assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
-    # Four widths are the least, even if most of them is lost: more than two of ten must be there.
-    for n, reported in ((40, 1), (39, 0)):
-        short = stepped(n, {20: 1.0})
-        short[:15] = short[26:] = np.nan
-        assert len(steps_module.steps_among_samples(short, 10)) == reported
-    assert steps_module.steps_among_samples(np.zeros((200, 4)), 10) == []
-
-
-def test_places_without_a_mean_have_no_step() -> None:
-    # Fifty of a hundred places have none: their middle one is half of the least that the drift makes of the others,
-    # 0.55, as three samples after the last are left. Ten times of that are more than the step.
-    dots = stepped(120, {30: 2.0})
-    dots[:, 3] = 0.1 * np.arange(120.0)
-    dots[62:] = np.nan
-    assert list(sizes_of(dots, 10).values()).count(0.0) == 50
-    assert steps_module.steps_among_samples(dots, 10) == []
-    assert len(steps_module.steps_among_samples(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
 
 
 @pytest.mark.parametrize(
@@ -306,35 +209,3 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     assert first([4.0, 0.0])[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
     last = shifted(note(19.0, 19.0, 1.0), loads, 0.5)
     assert last([4.0, 0.0])[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
-
-
-def test_effective_loads_change_at_the_fitted_times() -> None:
-    loads = np.zeros((30, 3))
-    loads[5:] = (1.0, 0.0, 0.0)
-    loads[12:] = (1.0, -2.0, 0.0)
-    loads[20:] = (0.0, 0.0, 3.0)
-    effective, notes = annotated_times.loads_with_times(
-        loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1
-    )
-    wanted = np.zeros((30, 3))
-    wanted[3:] += (1.0, 0.0, 0.0)
-    wanted[12:] += (0.0, -2.0, 0.0)
-    wanted[18:] += 0.5 * np.array((-1.0, 2.0, 3.0))
-    wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
-    assert effective == pytest.approx(wanted, abs=1e-5)
-    assert [(n.number, n.load) for n in notes] == [(1, (1.0, 0.0, 0.0)), (3, (0.0, 0.0, 3.0))]
-    assert [(n.annotated, n.applied, n.took) for n in notes] == [
-        pytest.approx((0.5, 0.3, 0.0)),
-        pytest.approx((2.0, 1.8, 0.2)),
-    ]
-    # What took a tenth of a second was no ramp.
-    (one,) = annotated_times.loads_with_times(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
-    assert one.took == 0.0
-    # From the second sample on, and one right after the other.
-    loads = np.zeros((6, 3))
-    loads[1:], loads[2:] = (1.0, 0.0, 0.0), (5.0, 2.0, 0.0)
-    assert annotated_times.loads_with_times(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
-    loads = np.zeros((30, 3))
-    loads[5:], loads[12:], loads[20:] = (1.0, 0.0, 0.0), (1.0, -2.0, 0.0), (0.0, 0.0, 3.0)
-    begun = np.add(loads, (7.0, 8.0, 9.0))
-    assert annotated_times.loads_with_times(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)

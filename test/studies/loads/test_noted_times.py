@@ -21,7 +21,6 @@ from psd_deflection.studies.loads.annotated_times import (
     CorrectedLoads,
     CorrectedNote,
     correct_loads,
-    ordinal,
     shifted,
 )
 from test.studies.held_loads import RIG, answers, read
@@ -64,6 +63,7 @@ def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedL
     return correct_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('late', 'rotated'),
     [
@@ -115,6 +115,7 @@ def test_a_faultless_rig_whose_loads_were_noted_some_ms_off_lacks_nothing() -> N
     assert [f.value for f in found.setup] == pytest.approx(JITTER, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_wiring_signs_and_units_change_no_time() -> None:
     other = QUIET[:, [1, 0, 2, 4, 3, 5]] * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
     found = corrected(other, annotated(LATE) * np.array([-0.102, 0.102, 0.102]))
@@ -122,6 +123,7 @@ def test_wiring_signs_and_units_change_no_time() -> None:
     assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.002)
 
 
+@pytest.mark.slow
 def test_lost_samples_change_no_time() -> None:
     read = QUIET.copy()
     read[np.random.default_rng(1).random(COUNT) < 0.3] = np.nan
@@ -141,6 +143,7 @@ def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
     assert not found.unused.any()
 
 
+@pytest.mark.slow
 def test_motion_that_no_ramp_describes_is_left_out() -> None:
     smooth = applied(0.8)
     for i in range(1, len(LEVELS)):
@@ -153,21 +156,6 @@ def test_motion_that_no_ramp_describes_is_left_out() -> None:
     assert found.unused[DWELL + 300]
     assert not found.unused[DWELL - 500]
     assert 'at rest' in found.notes[0].words('x.csv')
-
-
-def test_the_words_say_what_to_do() -> None:
-    found = corrected(QUIET, annotated(LATE))
-    assert found is not None
-    third = found.notes[2]
-    assert (third.name, third.where) == ('load_time', 'load 3')
-    assert third.value == pytest.approx(3.4, abs=2e-3)
-    assert third.words('x.csv') == (
-        'the 3rd load of x.csv (0 N, -50 N, -29 N m) was noted 3.400 s late: note it 15.000 s after the first sample, '
-        'not 18.400 s'
-    )
-    assert [ordinal(i) for i in (1, 2, 3, 4, 11, 12, 13, 21, 111)] == (
-        ['1st', '2nd', '3rd', '4th', '11th', '12th', '13th', '21st', '111th']
-    )
 
 
 def test_check_and_calibrate_say_the_same() -> None:
@@ -237,27 +225,3 @@ def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
     # Four quarters of a sample later nothing acts in the second sample.
     assert later([4.0])[1] == pytest.approx([0.0, 20.0, 0.0])
     assert later([4.0])[2:] == pytest.approx(0.0)
-
-
-def test_a_step_between_two_samples_has_its_time() -> None:
-    """Half a sample later than sample 10: the sum over the samples is -1/2, the moment about sample 10 is 1/8."""
-    loads = np.where(np.arange(20)[:, None] < 10, 0.0, [[4.0, -8.0, 2.0]])
-    later = shifted(CorrectedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
-    for more in (2.0, -2.0):
-        changed = later([more]) / [4.0, -8.0, 2.0]
-        assert changed.sum(axis=0) == pytest.approx(-0.25 * more)
-        about = np.arange(20) - 10.0 if more > 0.0 else np.arange(20) - 9.0
-        assert about @ changed == pytest.approx(0.125)
-        assert not changed[11:].any()
-        assert (loads + later([more]))[11:] == pytest.approx(np.tile([4.0, -8.0, 2.0], (9, 1)))
-
-
-@pytest.mark.slow
-def test_ramps_beside_a_sticking_clamp_have_the_fitted_times() -> None:
-    read = volts(applied(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
-    found = discover([Observation('x', RIG, read, annotated((0.0,) * 6))])
-    assert [e.active.label for e in found.effects] == ['clamp_friction (axis 3)']
-    assert found.effects[0].active.values['width'] == pytest.approx(2.3e-5, rel=1e-3)
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.05
-    assert [f.value for f in found.setup] == pytest.approx([0.8] * 6, abs=5e-4)

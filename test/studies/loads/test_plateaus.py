@@ -10,18 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import plateaus
 from psd_deflection.studies.loads.annotated_times import correct_loads, unannotated_steps
 from psd_deflection.studies.loads.plateaus import (
-    EXACT,
-    STANDS_OUT,
-    TOLERANCE,
     Plateau,
     PlateauLoads,
-    WrongNote,
     all_free,
     as_applied,
     wrong_notes,
@@ -64,6 +58,7 @@ def _rounded(words: str) -> str:
     return f'{before}({", ".join(f"{round(float(n)) + 0} {unit}" for n, unit in numbers)}){rest}'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'true',
     [
@@ -78,6 +73,7 @@ def test_no_note_is_called_wrong_for_what_the_rig_does(true: dict[str, object]) 
     assert wrong_notes(RIG, read(HELD, **true), HELD) == []
 
 
+@pytest.mark.slow
 def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     both = annotated_as(5, (80, -80, 40))
     both[DWELL : 2 * DWELL] = (0, -30, 0)
@@ -91,6 +87,7 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     assert wrong_notes(RIG, QUIET[: 4 * DWELL], NEVER[: 4 * DWELL]) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('number', 'load'),
     [
@@ -122,11 +119,7 @@ def long_as(**annotated: tuple[float, float, float]) -> FloatArray:
     return np.repeat(levels, DWELL, axis=0)
 
 
-def test_of_loads_that_follow_each_other_both_are_found() -> None:
-    found = wrong_notes(RIG, LONG_QUIET, long_as(p4=(0, 0, 0), p5=(40, -80, 20)))
-    assert [n.where for n in found] == ['load 4', 'load 5']
-
-
+@pytest.mark.slow
 def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
     found = wrong_notes(RIG, LONG_QUIET, long_as(p5=(40, -80, 20), p4=(60, 0, 0), p6=(0, 0, 0)))
     assert [n.where for n in found] == ['load 4', 'load 5', 'load 6']
@@ -134,6 +127,7 @@ def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
     assert note.words('x').endswith('(30 N, 0 N, 0 N m) hung, not (29 N, 0 N, 0 N m): note that')
 
 
+@pytest.mark.slow
 def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> None:
     # The only loads along X: both other ways.
     both = annotated_as(4, (-30, 0, 0))
@@ -145,6 +139,7 @@ def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> Non
     assert wrong_notes(RIG, soft, np.repeat(only, DWELL, axis=0)) == []
 
 
+@pytest.mark.slow
 def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
     # Without the third load a link that is soft by chance would explain the fourth.
     soft = read(HELD, link__youngs_modulus=0.97 * RIG.link.youngs_modulus)
@@ -155,13 +150,7 @@ def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
     assert wrong_notes(RIG, reading, HELD) == []
 
 
-def test_beside_an_effect_what_hung_is_reported_as_if_there_were_none() -> None:
-    soft = read(np.repeat(LONG, DWELL, axis=0), link__youngs_modulus=0.95 * RIG.link.youngs_modulus)
-    (note,) = wrong_notes(RIG, soft, long_as(p5=(40, -80, 20)))
-    assert note.where == 'load 5'
-    assert note.applied == pytest.approx((40.0, -40.0, 20.0), abs=0.3)
-
-
+@pytest.mark.slow
 def test_lost_samples_are_no_load() -> None:
     lost = QUIET.copy()
     lost[5 * DWELL + 1000 : 5 * DWELL + 1500] = np.nan
@@ -215,37 +204,6 @@ def reported(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
     return [(p.first, p.last, p.number, p.unannotated) for p in listed]
 
 
-def test_holds_of_a_second_have_the_number_of_their_note() -> None:
-    loads = np.zeros((9000, 3))
-    loads[1500:] = (1.0, 0.0, 0.0)
-    # A second is enough, a sample less is not, and a ramp ends once.
-    loads[2500:] = (1.0, 2.0, 0.0)
-    loads[3499:] = (1.0, 2.0, 3.0)
-    loads[5000:5049] = np.linspace((1.0, 2.0, 3.0), (1.0, 2.0, 0.0), 51)[1:-1][:49]
-    loads[5049:] = (1.0, 2.0, 0.0)
-    listed = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads, 7)
-    assert reported(listed) == [
-        (0, 1500, 0, False),
-        (1500, 2500, 1, False),
-        (3499, 5000, 3, False),
-        (5049, 9000, 4, False),
-    ]
-    assert [tuple(p.annotated) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
-    assert {p.recording for p in listed} == {7}
-    # From the second sample on, and two that follow each other in two samples.
-    loads[1:] += (5.0, 0.0, 0.0)
-    loads[6000:6002] = (0.0, 0.0, 1.0)
-    loads[6002:] = (0.0, 0.0, 2.0)
-    again = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads)
-    assert reported(again)[0] == (1, 1500, 1, False)
-    assert reported(again)[-1] == (6002, 9000, 7, False)
-    assert {p.recording for p in again} == {0}
-    assert reported(plateaus.plateaus(RIG, np.zeros((9000, 6)), np.ones((9000, 3)))) == [(0, 9000, 0, False)]
-    assert reported(plateaus.plateaus(RIG, np.zeros((999, 6)), np.ones((999, 3)))) == []
-    # Its load is the one in its middle.
-    assert Plateau(0, 10, 21, 1, False, np.zeros(3)).of(np.arange(90.0).reshape(30, 3)).tolist() == [45.0, 46.0, 47.0]
-
-
 def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
     annotated = acting.copy()
@@ -254,36 +212,6 @@ def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     assert [(p.number, p.unannotated) for p in listed] == [(0, False), (1, False), (1, True), (2, False)]
     assert [p.first for p in listed] == pytest.approx([0, 2000, 4000, 6000], abs=2)
     assert [p.last for p in listed] == pytest.approx([2000, 4000, 6000, 8000], abs=2)
-
-
-def test_steps_without_a_note_are_looked_for_in_the_dots_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked: list[FloatArray] = []
-
-    def unannotated(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
-        looked.append(dots)
-        return [2.0, 5.5]
-
-    monkeypatch.setattr(plateaus, 'unannotated_steps', unannotated)
-    volts, loads = np.random.default_rng(1).normal(size=(9000, 6)), np.zeros((9000, 3))
-    loads[4000:] = 1.0
-    listed = plateaus.plateaus(GIVEN, volts, loads)
-    assert reported(listed) == [
-        (0, 2000, 0, False),
-        (2000, 4000, 0, True),
-        (4000, 5500, 1, False),
-        (5500, 9000, 1, True),
-    ]
-    assert looked[0] == pytest.approx(volts[:, [0, 1, 3, 4]] * (4e-4, 6e-4, 5e-4, 8e-4))
-
-
-GIVEN = load_rig(
-    overrides={
-        'psd_1.sensitivity': [4e-4, 6e-4],
-        'psd_2.sensitivity': [5e-4, 8e-4],
-        'dynamics.bending_damping_ratio': 0.1,
-        'dynamics.torsion_damping_ratio': 0.2,
-    }
-)
 
 
 VARIED = np.array(
@@ -356,63 +284,6 @@ def test_a_faulty_detector_is_no_wrong_note() -> None:
         assert plateaus.outliers(observed(wrong, left=left), bent).gone == gone
 
 
-@pytest.mark.parametrize(
-    ('count', 'more', 'gone'),
-    [
-        # Others are off by a quarter of a newton: no more than the tolerance, 0.3 N, and a fifth of the wrong ones.
-        (8, {6: (0.0, 2.0, 0.0)}, (6,)),
-        (8, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0)}, (4, 6)),
-        (8, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0), 2: (0.0, 4.0, 0.0)}, ()),
-        (12, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0), 2: (0.0, 4.0, 0.0)}, ()),
-        (7, {6: (0.0, 2.0, 0.0)}, (6,)),
-        (7, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0)}, ()),
-    ],
-)
-def test_two_of_eight_notes_beside_small_errors_are_wrong(
-    count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
-) -> None:
-    twelve = np.vstack((VARIED, VARIED[1:5]))
-    slightly = np.where(np.arange(count)[:, None] % 2, 0.1, -0.1) * (1.0, 0.0, 0.0)
-    assert plateaus.outliers(observed(more, twelve[:count], everywhere=slightly)).gone == gone
-
-
-def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
-    softened = 0.1 * VARIED @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
-
-    def left(found: PlateauLoads, without: int) -> float:
-        return float(np.delete(plateaus.deviation_in_tolerances(found, (without,), 0.1), without).max())
-
-    # Without any other one, the worst that is left is one and a half times the tolerance.
-    found = observed({2: (0.0, 2.5, 0.0)}, everywhere=softened)
-    assert all(1.3 < left(found, k) < 1.8 for k in (1, 3, 4, 5, 6, 7))
-    assert plateaus.outliers(found).gone == (2,)
-    # Without the fourth it is 1.13 times, which may come from that one if a tenth of its 3.9 is allowed.
-    found = observed({3: (0.0, 6.0, 0.0)}, everywhere=softened)
-    assert left(found, 4) == pytest.approx(1.13, abs=0.01)
-    assert plateaus.deviation_in_tolerances(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
-    assert plateaus.outliers(found).gone == (3,)
-    assert plateaus.outliers(found, 0.025).gone == (3,)
-    assert plateaus.outliers(found, 0.1).gone == ()
-
-
-def test_a_wrong_load_is_known_if_the_others_span_it() -> None:
-    annotated = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
-
-    def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
-        rows = [i for i in range(5) if i < 3 or i in k]
-        here = [rows.index(i) for i in k]
-        return plateaus.is_known(observed(dict.fromkeys(here, more), annotated[rows]), np.array(here), largest)
-
-    # A torque of 5 % of (3, 4) is as good as none.
-    assert known([3])
-    assert not known([4])
-    assert not known([3, 4])
-    # More than twice the load, which is 5 long.
-    assert known([4], (0.0, 6.1, 8.1), 2.0)
-    assert not known([4], (0.0, 5.9, 7.9), 2.0)
-    assert known([3, 4], (0.0, 6.1, 8.1), 2.0)
-
-
 def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> None:
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
     loads = np.repeat(VARIED, DWELL, axis=0)
@@ -468,50 +339,7 @@ def test_loads_of_which_none_held_were_not_rounded() -> None:
     assert not plateaus.all_free(found, none)
 
 
-def test_loads_off_by_less_than_a_step_may_be_rounded() -> None:
-    annotated = np.array(
-        [(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)]
-    )
-
-    def may_be(*off: tuple[float, float, float], loads: FloatArray = annotated) -> bool:
-        more = np.zeros((len(loads), 3))
-        more[: len(off)] = off
-        return plateaus.may_be_rounded(observed({}, loads, everywhere=more))
-
-    assert may_be((4.9, 0.0, 0.0), (0.0, -4.9, 99.0))
-    assert not may_be((5.1, 0.0, 0.0))
-    assert not may_be((0.0, -5.1, 0.0))
-    # In no steps, no forces at all, fewer than four loads.
-    assert not may_be((0.0, 0.0, 0.0), loads=annotated + 0.3 * np.eye(3)[0])
-    assert not may_be((0.0, 0.0, 0.0), loads=annotated * [0.0, 0.0, 1.0])
-    assert not may_be((0.0, 0.0, 0.0), loads=annotated[1:])
-
-
 # ---- what is said
-
-
-def test_a_wrong_note_says_what_hung_from_when_to_when() -> None:
-    annotated = np.array([1.0, -2.0, 0.5])
-    wrong = WrongNote(Plateau(0, 1234, 5678, 2, False, annotated), np.array([1.004, -2.5, -0.001]), 1e-3)
-    assert (wrong.name, wrong.where) == ('load_value', 'load 2')
-    assert wrong.value == (1.004, -2.5, -0.001)
-    assert wrong.off == pytest.approx([0.004, 0.5, 0.501])
-    assert wrong.size == pytest.approx(0.501)
-    assert wrong.words('x') == (
-        'the 2nd load of x was noted wrong: from 1.234 s to 5.678 s (1 N, -2.5 N, 0 N m) hung, '
-        'not (1 N, -2 N, 0.5 N m): note that'
-    )
-    before = WrongNote(Plateau(0, 0, 5678, 0, True, annotated), np.array([-0.004, 0.006, 2.125]), 1e-2)
-    assert (before.name, before.where) == ('missing_load', '0.000 s')
-    assert before.words('x') == (
-        'something was hung or taken off of x and not noted: from 0.000 s to 56.780 s (0 N, 0.01 N, 2.12 N m) hung, '
-        'not (1 N, -2 N, 0.5 N m): note that'
-    )
-    after = WrongNote(Plateau(0, 100, 5678, 1, True, annotated), annotated, 1e-3)
-    assert (after.where, after.size) == ('0.100 s', 0.0)
-    assert after.words('x').startswith(
-        'something was hung or taken off after the 1st annotated load of x and not noted: '
-    )
 
 
 def world(
@@ -553,88 +381,6 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
     for one in found:
         assert one.applied == pytest.approx(VARIED[one.plateau.number], abs=0.05)
         assert one.period == 1e-3
-
-
-@pytest.mark.parametrize(('applied', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
-def test_a_load_off_by_2_n_is_simulated_as_the_readings_say(applied: float, far: bool) -> None:
-    # 46.67 - 40 is 2 + 4.667; 40 - 34 is 2 + 4, as the other force is 40.
-    truth = VARIED.copy()
-    truth[5] = (applied, -40.0, 20.0)
-    asked_with = []
-    inner = world(truth, VARIED, np.zeros((3, 3)))
-
-    def asked(acting: FloatArray) -> PlateauLoads:
-        asked_with.append(acting[5 * DWELL + 5].tolist())
-        return inner(acting)
-
-    (note,) = plateaus.wrong_notes_against(np.repeat(VARIED, DWELL, axis=0), 1e-3, asked)
-    assert note.applied == pytest.approx(truth[5])
-    assert asked_with[:2] == [[40.0, -40.0, 20.0], [0.0, 0.0, 0.0]]
-    assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
-
-
-def test_readings_are_compared_in_fine_means(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    held: list[tuple[FloatArray, FloatArray, int, int]] = []
-
-    def asked_for(
-        rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: list[Plateau]
-    ) -> PlateauLoads:
-        held.append((difference, count, samples, size))
-        return observed({}, VARIED[:0])
-
-    monkeypatch.setattr(plateaus, 'implied_loads', asked_for)
-    loads = np.tile((1.0, -5.0, 2.0), (400, 1))
-    for rate, size in ((1000.0, 4), (625.0, 2), (200.0, 1), (100.0, 1)):
-        rig = load_rig(overrides={'converter.sample_rate_hz': rate})
-        volts = ForwardModel(rig).expect(loads).volts.T + np.arange(400.0)[:, None] * (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-        volts[1, 0] = volts[100:104, 1] = np.nan
-        held.clear()
-        assert wrong_notes(rig, volts, loads) == []
-        difference, count, samples, by = held[0]
-        assert (samples, by, difference.shape) == (400, size, (6, 400 // size))
-        # Of 0, (1), 2, 3 that is 5/3, of what is not there 0.
-        first = [i for i in range(size) if i != 1]
-        assert difference[0, 0] == pytest.approx(sum(first) / len(first))
-        assert count[0, 0] == pytest.approx(len(first) / size)
-        assert (difference[1, 100 // size], count[1, 100 // size]) == (0.0, 0.0)
-        assert difference[5, -1] == pytest.approx(6.0 * np.arange(400 - size, 400).mean())
-
-
-def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    allowed: list[float] = []
-
-    def stand_out(found: PlateauLoads, bent: float, largest: float) -> plateaus.StandingOut:
-        allowed.append(bent)
-        return plateaus.StandingOut((5,))
-
-    monkeypatch.setattr(plateaus, 'outliers', stand_out)
-    truth = VARIED + np.where(np.arange(8)[:, None] == 5, 3.0, 0.0)
-    (note,) = plateaus.wrong_notes_against(
-        np.repeat(VARIED, DWELL, axis=0), 1e-3, world(truth, VARIED, np.zeros((3, 3)))
-    )
-    assert note.applied == pytest.approx(truth[5])
-    # A tenth, a fiftieth, nothing.
-    assert allowed == pytest.approx([0.1, 0.02, 0.0, 0.0, 0.0])
-
-
-def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -> None:
-    loads, asked_with = np.repeat(VARIED, DWELL, axis=0), list[FloatArray]()
-
-    def of_size(size: float) -> Callable[[FloatArray], PlateauLoads]:
-        def asked(acting: FloatArray) -> PlateauLoads:
-            asked_with.append(acting)
-            return observed({6: (0.0, size, 0.0)})
-
-        return asked
-
-    # A seventh of a newton: 0.15 of three times 0.3.
-    for size, asks in ((0.134, 1), (EXACT * STANDS_OUT * TOLERANCE, 3), (0.136, 3)):
-        asked_with.clear()
-        assert plateaus.wrong_notes_against(loads, 1e-3, of_size(size)) == []
-        assert len(asked_with) == asks
-    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: observed({}, VARIED[:0])) == []
 
 
 ONE_TORQUE = np.array(
@@ -679,15 +425,3 @@ def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> No
     )
     assert not free.exact
     assert free.applied == pytest.approx((24.0, -35.0, 0.0))
-
-
-def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    periods: list[float] = []
-
-    def annotated(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
-        periods.append(period)
-        return []
-
-    monkeypatch.setattr(plateaus, 'wrong_notes_against', annotated)
-    wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
-    assert periods == pytest.approx([0.005])

@@ -12,8 +12,6 @@ import pytest
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads import sway
 from psd_deflection.studies.loads.plateaus import Plateau, implied_beside_rig, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
@@ -47,6 +45,7 @@ def test_check_calibrate_and_discover_say_the_same() -> None:
     assert found.verdict == 'nothing_missing'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('force', 'frequency', 'axis'), [(0.5, 0.9, 0), (2.0, 1.6, 0), (1.0, 1.1, 1)])
 def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: float, axis: int) -> None:
     (found,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HELD)
@@ -76,22 +75,11 @@ def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
     assert (found.plateau.first, found.plateau.last) == (3 * DWELL, 4 * DWELL)
 
 
-@pytest.mark.slow
-def test_a_clamp_that_sticks_keeps_the_last_of_a_sway() -> None:
-    """Without the sway its friction would hold the link on the other side, as a law that switches then."""
-    friction = {'effects__e__name': 'clamp_friction', 'effects__e__width': 3e-6, 'effects__e__axis': 3}
-    found = discover([Observation('x', RIG, read(swung(0.8, 1.4375, number=6), **friction), HELD)])
-    assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
-    assert found.effects[0].active.values['width'] == pytest.approx(3e-6, rel=0.02)
-    assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
-    assert found.floors < 1.05
-    assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 6')]
-
-
 ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
 STICKS = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'true', [{}, ROTATED, STICKS, {'dynamics__bending_damping_ratio': 0.01}, {'link__length': 0.6}]
 )

@@ -73,6 +73,7 @@ def test_loads_missing_in_the_middle_are_left_out_until_the_next_note() -> None:
     np.testing.assert_array_equal(effective.loads, annotated)
 
 
+@pytest.mark.slow
 def test_two_loads_that_were_not_noted_are_reported_one_by_one() -> None:
     annotated = HELD.copy()
     annotated[2 * DWELL : 4 * DWELL] = LEVELS[1]
@@ -81,6 +82,7 @@ def test_two_loads_that_were_not_noted_are_reported_one_by_one() -> None:
     assert np.isfinite(effective.volts).all()
 
 
+@pytest.mark.slow
 def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
     effective = effective_loads(RIG, VOLTS, np.zeros_like(HELD))
     assert not effective.notes

@@ -56,6 +56,7 @@ LARGEST: dict[str, tuple[Cell, Cell, Cell]] = {
 UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('method', [m for m in methods() if m.label in AUDIT], ids=lambda m: m.label)
 def test_the_audits_table(method: Method) -> None:
     for i, condition in enumerate(CONDITIONS):
@@ -67,13 +68,6 @@ def test_the_audits_table(method: Method) -> None:
             assert got.silent == 0.0
         elif condition == 'independent tilts':
             assert got.silent == pytest.approx(0.058, abs=5e-4)
-
-
-def test_beam_is_exact_on_a_beam_and_the_flat_methods_on_a_flat_plate() -> None:
-    by_label = {m.label: m for m in methods()}
-    assert errors(by_label['beam, k = 1.5'], 'cantilever tilts').largest.max() < 1e-13
-    for label in ('exact (default)', 'iterative', 'minimum_tilt', 'wls_exact', 'wls_exact, thesis weights'):
-        assert errors(by_label[label], 'flat').largest.max() < 1e-13
 
 
 # Per cent of θ, ΔX, ΔY: Appendix D's iteration; weighted least squares.

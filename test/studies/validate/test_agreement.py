@@ -85,34 +85,6 @@ def test_slope_and_deviations_are_those_of_a_regression() -> None:
     assert even.bias_sd == pytest.approx(error.std(ddof=1) / math.sqrt(10.0))
 
 
-@pytest.mark.parametrize(
-    ('slope', 'noise', 'scale', 'mirrored'),
-    [
-        # The slope has a deviation of the noise over 10.
-        (0.21, 0.1, 1.0 / 0.21 - 1.0, False),
-        (0.19, 0.1, math.nan, False),
-        (1.0, 0.95, 0.0, False),
-        (1.0, 1.05, math.nan, False),
-        (-0.21, 0.1, math.nan, True),
-        (-0.19, 0.1, math.nan, False),
-        (-1.0, 0.95, math.nan, True),
-        (-1.0, 1.05, math.nan, False),
-    ],
-)
-def test_both_move_if_the_slope_is_above_a_fifth_and_known_to_a_tenth(
-    slope: float, noise: float, scale: float, mirrored: bool
-) -> None:
-    estimate = np.resize([1.0, 1.0, -1.0, -1.0], 100)
-    # No more in common with the estimate than with a constant.
-    error = noise * np.resize([1.0, -1.0], 100) * math.sqrt(0.98)
-    found = agreement(estimate, slope * estimate + error)
-    assert found.scale == pytest.approx(scale, nan_ok=True)
-    assert math.isfinite(found.share) == math.isfinite(scale)
-    assert found.mirrored is mirrored
-    together = np.sqrt(((1.0 - slope) ** 2 * 100.0 + 98.0 * noise**2) / 99.0)
-    assert found.noise == pytest.approx(noise if math.isfinite(scale) else together)
-
-
 def test_an_estimate_that_stands_still_has_no_scale() -> None:
     found = agreement(np.full(20, 0.5), np.resize([0.0, 1.0, 0.2], 20))
     assert math.isnan(found.scale)

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.integrate import quad
-from scipy.optimize import brentq
 from scipy.stats import median_abs_deviation
 
 from psd_deflection.base.errors import RecordingError
@@ -23,8 +21,6 @@ from psd_deflection.studies.validate.clock import (
     Offset,
     OffsetFit,
     UsedReferences,
-    biweight_sum,
-    clock_offset,
     coarse_offsets,
     refined_offset,
 )
@@ -91,57 +87,6 @@ def test_the_sentence_word_for_word(found: Offset, words: str) -> None:
 # Which offset it is
 
 
-def biweight(u: float) -> float:
-    """Beaton and Tukey: the influence of u is u (1 - (u / 4.685)^2)^2, beyond 4.685 none."""
-    return 2.0 * float(quad(lambda s: s * (1.0 - (s / 4.685) ** 2) ** 2, 0.0, min(abs(u), 4.685))[0])
-
-
-def test_the_biweight_is_the_integral_of_its_influence() -> None:
-    u = [[0.1, -0.5, 3.0], [4.6, 4.7, -60.0]]
-    of_each = [sum(biweight(v) for v in row) for row in u]
-    assert biweight_sum(np.array(u)) == pytest.approx(0.5 * sum(of_each), rel=1e-9)
-    assert biweight_sum(np.array(u[:1])) == pytest.approx(of_each[0], rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ('first', 'last', 'moved'),
-    [
-        (11.02, 14.0, True),
-        (10.98, 14.0, False),
-        (-5.0, -1.02, True),
-        (-5.0, -0.95, False),
-        (11.5, 31.5, True),
-        (-0.5, 10.5, False),
-    ],
-)
-def test_stamps_of_another_day_are_laid_on_the_motion(
-    monkeypatch: pytest.MonkeyPatch, first: float, last: float, moved: bool
-) -> None:
-    """The motion is from 0 s to 10 s, and an offset of at most 1 s is looked for."""
-    asked = []
-
-    def offset(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
-        asked.append((t.tolist(), largest, exposure))
-        return Offset(0.25, 1e-3, 2e-6, 3e-6, True, (0.5, -0.5), 77)
-
-    monkeypatch.setattr(clock, 'offset_near', offset)
-    motion = of(np.linspace(0.0, 10.0, 101), np.zeros((101, 3)), 0.1)
-    t = np.linspace(first, last, 50)
-    found = clock_offset(motion, t, np.zeros((50, 3)))
-    ((times, largest, exposure),) = asked
-    base = -first if moved else 0.0
-    assert times == pytest.approx((t + base).tolist())
-    assert largest == pytest.approx(max(10.0, last - first) if moved else 1.0)
-    assert exposure == 0.0
-    assert found == Offset(0.25 + base, 1e-3, 2e-6, 3e-6, True, (0.5 + base, -0.5 + base), 77)
-
-
-def test_the_motion_may_begin_at_any_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, 'offset_near', lambda _motion, t, *_: Offset(t[0], 0.1, 0.0, 0.0, True, (), 77))
-    motion = of(np.linspace(100.0, 110.0, 101), np.zeros((101, 3)), 0.1)
-    assert clock_offset(motion, np.linspace(3.0, 5.0, 50), np.zeros((50, 3))).value == pytest.approx(197.0)
-
-
 def fit_with(value: float, left: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0)) -> OffsetFit:
     """Leaves so much on every axis of 50 references."""
     return OffsetFit(value, 1e-3 + abs(value), 2e-6, 3e-6, np.full((50, 3), left), np.array(sizes))
@@ -164,48 +109,6 @@ def found_of(
     monkeypatch.setattr(clock, 'refined_offset', refined)
     motion = of(np.arange(512.0) / 256.0, np.zeros((512, 3)), 1.0 / 256.0)
     return clock.offset_near(motion, np.arange(50.0) / 50.0, poses, largest, 0.0), reported
-
-
-def test_the_best_fit_is_taken_and_what_fits_as_well_is_a_rival(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On 150 numbers what is left of 0.1 is a chi-square of 1.5, and sqrt(0.01 + x / 150) is one of x more."""
-    fits = [
-        fit_with(0.3, np.sqrt(0.01 + 19.0 / 150.0)),
-        None,
-        fit_with(0.1, 0.1),
-        # Within five samples it is the same offset.
-        fit_with(0.1 + 4.9 / 256.0, 0.1),
-        fit_with(0.1 - 4.9 / 256.0, 0.1),
-        fit_with(0.1 + 5.1 / 256.0, 0.2),
-        fit_with(0.1 - 5.1 / 256.0, 0.2),
-        fit_with(-0.2, np.sqrt(0.01 + 22.0 / 150.0)),
-        # Beyond what is looked for, but for five samples; it would be better.
-        fit_with(0.5 + 5.1 / 256.0, 0.0),
-        fit_with(-0.5 - 5.1 / 256.0, 0.0),
-        fit_with(0.5 + 4.9 / 256.0, 0.3),
-        fit_with(-0.5 - 4.9 / 256.0, 0.3),
-    ]
-    found, reported = found_of(monkeypatch, fits, np.zeros((50, 3)))
-    assert (found.value, found.sd, found.drift, found.drift_sd) == (0.1, 0.101, 2e-6, 3e-6)
-    assert found.used == 50
-    places = (0.3, 0.1 + 5.1 / 256.0, 0.1 - 5.1 / 256.0, 0.5 + 4.9 / 256.0, -0.5 - 4.9 / 256.0)
-    assert found.alternatives == pytest.approx(places)
-    assert reported == [None, 0.3, 0.3, *[0.1] * 9]
-
-
-def test_five_samples_apart_is_near_still(monkeypatch: pytest.MonkeyPatch) -> None:
-    fits = [fit_with(0.25, 0.1), fit_with(0.25 + 5.0 / 256.0, 0.2), fit_with(0.5 + 5.0 / 256.0, 0.2)]
-    assert found_of(monkeypatch, fits, np.zeros((50, 3)))[0].alternatives == (0.5 + 5.0 / 256.0,)
-
-
-@pytest.mark.parametrize(('level', 'explained'), [(101.0, True), (99.0, False)])
-def test_a_motion_explains_what_lowers_chi_square_by_100(
-    monkeypatch: pytest.MonkeyPatch, level: float, explained: bool
-) -> None:
-    """References that are as far below as above their middle on two axes, 100 numbers, and a fit that leaves 0.1."""
-    size = brentq(lambda u: 100.0 * biweight(u) - 150.0 * biweight(0.1) - level, 0.0, 4.0)
-    poses = 7.0 + np.outer(np.resize([-size, size], 50), [2.0, 2.0, 0.0])
-    found, _ = found_of(monkeypatch, [fit_with(0.1, 0.2, (2.0, 2.0, 2.0))], poses)
-    assert found.explained is explained
 
 
 def test_without_a_fit_there_is_no_offset(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,6 +138,7 @@ def coarse_by_hand(poses: Array, there: Array, place: Array, reference: Array, r
     return [lags[i] for i in sorted(lowest, key=lambda i: cost[i])[:5]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize(
     ('samples', 'first', 'step', 'references', 'reach'),
@@ -288,6 +192,7 @@ def test_offsets_up_to_the_largest_are_tried_and_no_others(sign: int) -> None:
 # The refinement
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('outliers', [0, 6])
 @pytest.mark.parametrize('still', [False, True])
 def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, still: bool) -> None:
@@ -380,37 +285,6 @@ def test_an_exact_reference_has_an_exact_drift(drift: float) -> None:
     assert fit.drift == pytest.approx(drift, rel=1e-3)
 
 
-@pytest.mark.parametrize(('above', 'finished'), [(195.0, True), (205.0, False)])
-def test_what_is_ten_rivals_above_the_best_is_not_finished(
-    monkeypatch: pytest.MonkeyPatch, above: float, finished: bool
-) -> None:
-    """The best has ``above`` less in chi-square than this has after its second pass."""
-    rng = np.random.default_rng(1)
-    t = np.arange(1000.0) * 1e-3
-    motion = of(t, np.stack([np.sin(9.0 * t), np.cos(14.0 * t), t], axis=1))
-    at = np.linspace(0.1, 0.9, 60)
-    poses = np.stack([np.sin(9.0 * at), np.cos(14.0 * at), at], axis=1) + rng.normal(0.0, 0.1, (60, 3))
-    with monkeypatch.context() as patched:
-        patched.setattr(clock, 'PASSES', 2)
-        second = refined_offset(motion, at, poses, 0.03, 0.0, None)
-    assert second is not None
-    sizes = 0.5 * second.sizes
-    level = sum(biweight(u) for u in (second.residual / sizes).ravel()) - above
-    even = brentq(lambda u: 180.0 * biweight(u) - level, 0.0, 4.6)
-    best = OffsetFit(0.0, 1e-3, 0.0, 0.0, even * np.resize(sizes, (60, 3)), sizes)
-    passes = []
-    solved = UsedReferences.solved
-
-    def counted(used: UsedReferences, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
-        passes.append(used)
-        return solved(used, weights)
-
-    monkeypatch.setattr(UsedReferences, 'solved', counted)
-    refined_offset(motion, at, poses, 0.03, 0.0, best)
-    assert (len(passes) > 2) is finished
-    assert finished or len(passes) == 2
-
-
 def steps_of(monkeypatch: pytest.MonkeyPatch, start: float, noise: float) -> list[float]:
     """The steps of a refinement of an offset of 12.3 ms from ``start``."""
     rng = np.random.default_rng(1)
@@ -430,20 +304,6 @@ def steps_of(monkeypatch: pytest.MonkeyPatch, start: float, noise: float) -> lis
         patched.setattr(UsedReferences, 'solved', recorded)
         assert refined_offset(motion, at - 0.0123, poses, start, 0.0, None) is not None
     return steps
-
-
-def test_a_refinement_ends_with_a_step_below_a_tenth_of_a_microsecond(monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = steps_of(monkeypatch, 0.0, 0.02)
-    assert 3 < len(steps) < 12
-    assert steps[-1] < 1e-7
-    assert min(steps[2:-1]) >= 1e-7
-    # The weights of outliers are those of the second pass, so there are three.
-    assert len(steps_of(monkeypatch, 0.0123, 1e-9)) == 3
-
-
-def test_a_refinement_ends_after_twelve_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, 'SETTLED', 0.0)
-    assert len(steps_of(monkeypatch, 0.0, 0.02)) == 12
 
 
 # Scores that follow each other

@@ -54,32 +54,6 @@ def test_each_instant_has_the_polynomial_through_the_samples_about_it(exposure: 
             assert variances[i, channel] == pytest.approx(left @ left / (len(u) - 5) * factor, rel=1e-7)
 
 
-@pytest.mark.parametrize(
-    ('exposure', 'before', 'after', 'answer'),
-    [
-        (0.0, 8, 9, True),
-        (0.0, 5, 7, True),
-        (0.0, 5, 6, False),
-        (0.0, 3, 9, True),
-        (0.0, 2, 9, False),
-        # With an exposure of four samples the fit takes ten on either side.
-        (4.0, 3, 11, True),
-        (4.0, 2, 11, False),
-        (4.0, 10, 3, True),
-        (4.0, 10, 2, False),
-    ],
-)
-def test_twelve_samples_are_needed_and_three_on_either_side(
-    exposure: float, before: int, after: int, answer: bool
-) -> None:
-    """A sample at the instant counts as after it. ``exposure`` in samples."""
-    near = np.arange(50.0 - before, 50.0 + after)
-    motion = of(np.concatenate([np.arange(30.0), near, np.arange(70.0, 90.0)]))
-    for array in motion.dots_at(np.array([50.0 * PERIOD]), exposure * PERIOD):
-        assert np.isfinite(array).all() == answer
-        assert np.isnan(array).all() != answer
-
-
 def test_nothing_is_known_of_instants_outside_the_samples() -> None:
     motion = of(np.arange(40.0))
     values, _, _ = motion.dots_at(np.array([-5.0, 2.0, 2.5, 3.0, 36.0, 36.5, 37.5, 60.0]) * PERIOD)

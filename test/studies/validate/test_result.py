@@ -142,18 +142,3 @@ def test_programs_get_si_units() -> None:
     assert [one['unit'] for one in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
     assert tree['solvers']['wls']['dy']['bias'] == 1.5e-6
     assert list(tree['covered']) == ['dx', 'dy', 'theta']
-
-
-def test_the_table_has_one_row_a_reference() -> None:
-    table = PLAIN.table()
-    assert (table.index.name, table.index.unit, table.index.values.tolist()) == ('t', 's', [0.0, 1.0, 2.0, 3.0])
-    assert [(c.name, c.unit) for c in table.columns] == [
-        (f'{of}_{axis}', unit)
-        for of in ('reference', 'exact', 'wls')
-        for axis, unit in (('dx', 'm'), ('dy', 'm'), ('theta', 'rad'))
-    ]
-    assert table.columns[1].values.tolist() == [1.0, 4.0, 7.0, 10.0]
-    assert table.columns[5].values.tolist() == [20.0, 50.0, 80.0, 110.0]
-    assert [c.description for c in table.columns] == [of for of in ('reference', 'exact', 'wls') for _ in range(3)]
-    assert table.attributes == {'solver': 'exact'}
-    assert PLAIN.sources == {'recording': 'run.csv', 'reference': 'camera.csv'}
