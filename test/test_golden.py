@@ -60,9 +60,7 @@ def test_a_golden_recording_gives_its_estimates_and_rejections(name: str) -> Non
         np.testing.assert_allclose(recorded.pose, again, rtol=0, atol=1e-12)
 
 
-def test_a_fresh_recording_of_this_machine_replays_to_the_last_bit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fresh_recording_replays_to_the_last_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Replayed here into a bag of its own, which then is of this machine.
     again = tmp_path / 'again'
     assert main(['replay', str(BAGS / 'lost_samples'), '--out', str(again)]) == 0

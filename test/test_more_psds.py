@@ -82,7 +82,7 @@ def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
 
 
 @pytest.mark.slow
-def test_what_a_third_psd_leaves_out_has_its_default_and_goes_round(three: Rig) -> None:
+def test_third_psd_defaults_are_filled_and_round_trip(three: Rig) -> None:
     assert three.psds[2].center == (0.08, -0.06)
     assert (three.psds[2].height, three.beams[2].angle, three.psds[2].axes) == (0.0, (0.0, 0.0), ('x', 'y'))
     assert load_rig(overrides=three.flat()) == three
@@ -269,7 +269,7 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
 
 @pytest.mark.slow
 @pytest.mark.parametrize('psd', [0, 2])
-def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig, psd: int) -> None:
+def test_one_degree_of_freedom_blames_no_psd(three: Rig, psd: int) -> None:
     records, truth, pipeline = run(three, inverted(psd))
     assert len(primaries(records)) == 180
     assert_inside(records, truth)
@@ -284,7 +284,7 @@ def test_a_stuck_psd_reports_on_itself_where_the_check_cannot(three: Rig) -> Non
     assert [s.excluded for s in spots_of(records)].count((2,)) > 70
 
 
-def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: Rig) -> None:
+def test_frozen_psd_is_not_the_psd_that_contradicts(three: Rig) -> None:
     """At rest PSD 1 is 1 mm off; PSD 3 does not move by a bit, as a quiet one may."""
     rig = with_solver(three, 'exact', **LEVEL)
     counts = at_rest(rig, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]), 200, 1)
@@ -371,9 +371,7 @@ def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solv
 
 
 @pytest.mark.slow
-def test_a_recording_of_three_is_replayed_without_a_differing_bit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recording_of_three_psds_replays_bit_for_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ['--params-file', str(THREE), '--loads', 'steps:0,0,0;0,-20,-4:0.6']
     assert main(['simulate', *words, '--out', str(tmp_path / 'a')]) == 0
     assert main(['replay', str(tmp_path / 'a'), '--out', str(tmp_path / 'b.mcap')]) == 0

@@ -35,7 +35,7 @@ def test_a_speed_is_that_over_a_tenth_of_a_second(period: float) -> None:
 
 
 @pytest.mark.parametrize('pause', [0.0, 2.0 * KNOWN_S])
-def test_names_that_strangers_make_up_take_no_memory_and_no_place(pause: float) -> None:
+def test_flood_of_unknown_joint_names_stays_bounded(pause: float) -> None:
     known, now = KnownJoints(), 0.0
     for n in range(300):
         known.notify(now, ['shoulder'], [0.5])

@@ -35,7 +35,7 @@ def test_every_operation_has_an_order_of_its_own() -> None:
     assert {name for name in own if not name.startswith('_')} == ours
 
 
-def test_sine_and_cosine_are_right_to_two_units_in_the_last_place() -> None:
+def test_sine_and_cosine_are_within_two_ulps() -> None:
     # Near a multiple of pi the error counts against the rounding of the reduced angle, some 1e-17.
     assert ulps(FIXED.sin_many(ANGLES), np.sin(ANGLES), 1e-2) <= 2.0
     assert ulps(FIXED.cos_many(ANGLES), np.cos(ANGLES), 1e-2) <= 2.0
@@ -62,7 +62,7 @@ def test_arcs_on_the_axes_have_the_signs_of_the_standard(y: float, x: float) -> 
         assert math.copysign(1.0, got) == math.copysign(1.0, math.atan2(y, x))
 
 
-def test_exponential_and_logarithm_are_right_to_two_units_in_the_last_place() -> None:
+def test_exponential_and_logarithm_are_within_two_ulps() -> None:
     x = np.concatenate((np.linspace(-690.0, 300.0, 3001), 1e-3 * np.linspace(-1.0, 1.0, 501)))
     assert ulps(FIXED.exp_many(x), np.exp(x)) <= 2.0
     # Beside 1 the logarithm is that of a difference that is exact.
@@ -165,7 +165,7 @@ def test_sums_in_threads_do_not_meet() -> None:
 
 
 @pytest.mark.parametrize('part', [1e-9, -1e-9, 1e-15, -1e-15, 0.0])
-def test_whether_a_matrix_is_positive_is_reported_by_its_pivots_where_rounding_decides(part: float) -> None:
+def test_definiteness_near_rounding_follows_pivots(part: float) -> None:
     rng = np.random.default_rng(5)
     vectors = np.linalg.qr(rng.normal(size=(12, 12)))[0]
     a = (vectors * [part, *np.linspace(0.1, 1.0, 11)]) @ vectors.T
@@ -215,7 +215,7 @@ def test_a_transform_is_that_of_numpy(length: int, count: int) -> None:
 
 
 @pytest.mark.parametrize('length', [20, 1000, 50_000])
-def test_products_with_what_is_later_are_whole_numbers_that_no_order_of_the_sum_changes(length: int) -> None:
+def test_lagged_products_ignore_summation_order(length: int) -> None:
     rng = np.random.default_rng(length)
     series = np.column_stack((rng.normal(0.0, 3e-6, length), 1e-3 + rng.normal(0.0, 1e-6, length), np.zeros(length)))
     got = lagged_products(series, 3)
@@ -347,7 +347,7 @@ def functions_of(path: Path) -> list[tuple[str, ast.AST]]:
     return out
 
 
-def test_nothing_on_the_way_of_a_block_leaves_the_order_to_the_processor() -> None:
+def test_block_path_has_no_processor_dependent_code() -> None:
     files = [f for name in PIPELINE for f in (sorted((PACKAGE / name).glob('*.py')) or [PACKAGE / name])]
     wrong, used = [], set()
     for path in files:

@@ -11,7 +11,7 @@ import numpy as np
 from psd_deflection.base.axes import ranges
 
 
-def test_the_range_of_poses_is_in_micrometres_and_thousandths_of_a_degree() -> None:
+def test_pose_ranges_are_in_um_and_millidegrees() -> None:
     poses = np.array([[1e-6, -2e-3, math.radians(0.5)], [3e-6, math.nan, math.radians(-0.25)], [2e-6, 1e-3, 0.0]])
     assert ranges(poses) == [
         ('ΔX', '+1.00 … +3.00 µm'),

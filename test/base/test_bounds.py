@@ -43,7 +43,7 @@ def test_two_threads_do_not_take_the_same_bytes() -> None:
 
 
 @pytest.mark.parametrize('way', ['item', 'setdefault', 'update'])
-def test_a_map_keeps_what_is_set_again_and_forgets_a_flood_of_names(way: str) -> None:
+def test_bounded_map_keeps_updated_key_under_flood(way: str) -> None:
     known: BoundedMap[str, int] = BoundedMap(10)
     for n in range(10_000):
         known['ours'] = n
@@ -81,7 +81,7 @@ def test_a_rate_is_bounded_second_by_second() -> None:
     assert allowed == [True, True, False, False, True, True, False]
 
 
-def test_a_key_that_is_set_again_is_never_gone_for_another_thread() -> None:
+def test_updated_key_is_never_missing_for_a_thread() -> None:
     class Word(str):
         """Its hash is asked for whenever a map is changed: there another thread may read."""
 

@@ -109,7 +109,7 @@ def test_a_page_without_a_chart_runs_nothing() -> None:
     assert '<script' not in text
 
 
-def test_the_policy_of_a_page_lets_its_own_scripts_run_and_no_other() -> None:
+def test_page_policy_allows_only_its_own_scripts() -> None:
     chart = drawn(one(np.arange(2.0), np.arange(2.0)))
     text = page('title', [chart, chart])
     scripts = re.findall(r'<script type="(?:text/javascript|module)">(.*?)</script>', text, flags=re.S)

@@ -135,7 +135,7 @@ def test_a_key_switches_its_curve_in_every_plot(page: Page) -> None:
 
 
 @pytest.mark.slow
-def test_a_drag_looks_closer_in_all_plots_of_one_axis_and_a_button_goes_back(page: Page) -> None:
+def test_drag_zooms_plots_of_axis_and_button_resets(page: Page) -> None:
     full = 'document.querySelector("button.whole").checkVisibility()'
     assert not page.js(full)
     over = page.driver.find_element(By.CSS_SELECTOR, '#plot_c0p1 .u-over')

@@ -23,7 +23,7 @@ def test_the_next_one_a_gap_and_a_repeat() -> None:
 
 
 @given(st.integers(0, 2**40), st.integers(0, WRAP - 1))
-def test_a_restart_from_any_number_leaves_out_less_than_two_blocks(last: int, seq: int) -> None:
+def test_restart_at_any_number_skips_under_two_blocks(last: int, seq: int) -> None:
     s = SequenceExtender(20)
     s.extend(last % WRAP, 10**6)
     before, _, _ = s.extend((last + 1) % WRAP, 10**6 + 1000)
@@ -89,7 +89,7 @@ def test_the_extended_number_follows_the_true_one(start: int, steps: list[int]) 
 
 
 @given(st.lists(st.tuples(st.integers(0, WRAP - 1), st.integers(0, 2**53)), max_size=60))
-def test_whatever_comes_a_number_that_is_kept_is_above_those_before(samples: list[tuple[int, int]]) -> None:
+def test_kept_numbers_always_increase(samples: list[tuple[int, int]]) -> None:
     s = SequenceExtender(20)
     last = -1
     for seq, t_us in samples:
@@ -135,7 +135,7 @@ class Recorded:
         return np.rint(np.array(ms) * 1e6).astype(np.int64)
 
 
-def test_a_recording_goes_on_if_neither_number_nor_time_goes_back() -> None:
+def test_recording_follows_if_number_and_time_increase() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     assert of.follows([8, 9], [8.0, 9.0])
     assert not of.follows([7, 8, 9], [8.0, 9.0, 10.0])
@@ -147,7 +147,7 @@ def test_a_recording_goes_on_if_neither_number_nor_time_goes_back() -> None:
     assert not of.follows([8, 9], [7.0, 9.0])
 
 
-def test_a_time_that_goes_back_is_reported_and_the_last_time_counts() -> None:
+def test_time_going_back_is_reported_and_then_kept() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     assert of.extended([8, 9, 10], [6.5, 8.0, 9.0]) == [8, 9, 10]
     assert of.message == ['time goes back to 6500000 ns']
@@ -155,7 +155,7 @@ def test_a_time_that_goes_back_is_reported_and_the_last_time_counts() -> None:
     assert of.follows([11], [9.5])
 
 
-def test_a_message_in_which_number_or_time_stands_still_is_rejected() -> None:
+def test_constant_seq_or_time_in_message_is_rejected() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     with pytest.raises(ValueError, match='seq does not rise'):
         of.extended([8, 9, 9], [8.0, 9.0, 10.0])
@@ -164,7 +164,7 @@ def test_a_message_in_which_number_or_time_stands_still_is_rejected() -> None:
     assert of.extended([8, 9], [8.0, 8.000001]) == [8, 9]
 
 
-def test_a_recorded_number_has_wrapped_if_20_khz_gives_as_many_samples() -> None:
+def test_number_wraps_up_to_20_khz_and_restarts_above() -> None:
     """In 50 000 s these are 10^9 samples, and a thousand for a clock that is off."""
     last, most = 4_000_000_000, 1_000_001_000
     of = Recorded([last], [0.0])
@@ -193,7 +193,7 @@ def test_the_number_after_the_last_of_32_bits_is_0_and_goes_on() -> None:
     assert (of.message, of.restarts) == ([], [])
 
 
-def test_whole_numbers_that_go_back_within_a_message_are_rejected() -> None:
+def test_decreasing_full_numbers_are_rejected() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     with pytest.raises(ValueError, match='seq does not rise'):
         of.extended([9, 8], [8.0, 9.0], full=True)
@@ -201,7 +201,7 @@ def test_whole_numbers_that_go_back_within_a_message_are_rejected() -> None:
         of.extended([9, 8, 10], [8.0, 9.0, 10.0])
 
 
-def test_a_wrap_within_a_message_and_numbers_that_were_recorded_whole() -> None:
+def test_wrap_and_full_numbers_extend_sequence() -> None:
     assert Recorded([WRAP - 3], [0.0]).extended([WRAP - 2, WRAP - 1, 0, 1], [1.0, 2.0, 3.0, 4.0]) == [
         *range(WRAP - 2, WRAP + 2)
     ]

@@ -65,7 +65,7 @@ def test_any_choice_within_a_grammar_is_answered(name: str) -> None:
 
 
 @pytest.mark.parametrize('name', [n for n in TARGETS if n not in GRAMMARS])
-def test_fuzz_targets_take_what_is_good_and_reject_what_was_found_bad(name: str) -> None:
+def test_fuzz_targets_accept_good_and_reject_bad_input(name: str) -> None:
     target, seeds = TARGETS[name]()
     assert evaluated(target, seeds[0]) == []
     assert evaluated(target, b'\x00\x03nonsense\x00') != []

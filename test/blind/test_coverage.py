@@ -30,7 +30,7 @@ def covers(part: Inside) -> bool:
     return all(0.92 < share < 0.98 for share in (*part.axes, part.joint))
 
 
-def test_a_drift_with_temperature_that_the_rig_file_knows_is_covered() -> None:
+def test_temperature_drift_in_rig_file_is_covered() -> None:
     assert covers(warming(rest_s=26, steps=2, seed=3).rest)
     # The judge can say no.
     assert warming(reported=False, rest_s=26, steps=2, seed=3).rest.joint < 0.8

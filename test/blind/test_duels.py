@@ -48,7 +48,7 @@ def oscillator(folder: Path) -> FloatArray:
     return y
 
 
-def test_the_cubic_spring_of_a_made_silverbox_is_found_with_its_size(tmp_path: Path) -> None:
+def test_cubic_spring_of_synthetic_silverbox_is_found(tmp_path: Path) -> None:
     y = oscillator(tmp_path)
     plant = Silverbox(tmp_path, train=(0, COUNT), shape=(4, 6))
     np.testing.assert_allclose(plant.y, y, atol=1e-9)

@@ -41,7 +41,7 @@ def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
     assert not evaluated(None, {**reported(), 'unknown': []})['alarm']
 
 
-def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
+def test_dot_jump_may_be_reported_as_detector_jumps() -> None:
     truth = {**law_forms.draw(1, 'optics', 'events'), 'where': 'x2', 'times': [5.4, 9.0], 'gap': 9.0}
     found = [{'name': 'jump', 'where': 'psd_2', 'value': t} for t in (9.002, 5.399)]
     nothing = {**reported(), 'unknown': [], 'verdict': 'nothing_missing'}
@@ -61,7 +61,7 @@ def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
         assert not evaluated({**truth, **other}, {**nothing, 'setup': found})['jumps']
 
 
-def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -> None:
+def test_law_of_single_load_may_be_load_value() -> None:
     truth = next(law for law in drawn(1400, 12) if law['number'] == 1410)
     truth = {**truth, 'size': 0.5}
     found = [{'name': 'load_value', 'where': 'load 6', 'value': [30.0, 0.57, 0.0]}]

@@ -16,7 +16,7 @@ from blind.redone import SHORT, HeldLoad, main, motion
 pytestmark = pytest.mark.slow
 
 
-def test_the_weight_on_the_sidebar_turns_the_link_as_far_as_the_beam_says() -> None:
+def test_sidebar_weight_rotates_link_as_beam_predicts() -> None:
     """50 N, 0.585 m from the link: -2.23 mm and 0.94 degrees, 0.12 mm sideways because the rig leans."""
     pose = motion(SHORT, HeldLoad(50.0, 1))
     assert np.abs(pose[: round(1000 * SHORT.rest)]).max() < 1e-9

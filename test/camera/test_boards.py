@@ -57,7 +57,7 @@ def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
     assert np.all(np.abs(off) < 5.0 * np.sqrt(np.diag(answer.covariance)))
 
 
-def test_the_noise_of_a_board_is_what_its_pose_leaves_of_the_corners() -> None:
+def test_board_noise_is_pose_residual_over_freedom() -> None:
     """A pose takes six of the independent values; the residuals are those of OpenCV's projection."""
     board = target_of(BOARD)
     assert isinstance(board, Board)

@@ -81,7 +81,7 @@ def test_a_tilt_of_the_plate_is_observed_and_does_not_turn_theta() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('tilt', [(0.0, 0.0), (0.1, -0.08)], ids=['frontal', 'from the side'])
-def test_without_a_lens_what_is_reported_of_the_error_is_its_size(tilt: tuple[float, float]) -> None:
+def test_reported_error_without_lens_has_its_true_size(tilt: tuple[float, float]) -> None:
     """The mirrored tilt is no error of dX, dY or theta, and perspective is seen without knowing the focal length."""
     rng = np.random.default_rng(8)
     shifts = rng.uniform(-3e-3, 3e-3, (10, 2)).tolist()
@@ -125,7 +125,7 @@ def test_the_mean_over_the_exposure_is_what_counts() -> None:
     assert math.sqrt(answer.covariance[0, 0]) > 2 * still
 
 
-def test_a_lens_that_loses_its_focus_moves_no_plate_observed_from_the_side() -> None:
+def test_defocus_of_oblique_view_moves_no_plate() -> None:
     """The blur along a bent rim moves it, more at the ends of an ellipse than at its sides."""
     scene, rng = Scene(tilt=(0.29, 0.15), blur=0.5, read_noise=0.5), np.random.default_rng(4)
     reference = CameraReference(replace(settings_of(scene), rest_frames=2), target_of)
@@ -136,7 +136,7 @@ def test_a_lens_that_loses_its_focus_moves_no_plate_observed_from_the_side() -> 
     assert math.hypot(answer.dx - 1e-3, answer.dy - 1e-3) < 30e-6
 
 
-def test_a_disc_that_just_saturates_tilts_the_plate_by_no_more_than_is_reported() -> None:
+def test_saturating_disc_tilts_plate_within_its_sd() -> None:
     scene = Scene(focal=1500.0, white=240.0, slope=(0.0, 0.45), tilt=(0.15, 0.06), blur=1.0, read_noise=0.9)
     rng = np.random.default_rng(6)
     reference = CameraReference(replace(settings_of(scene), rest_frames=1), target_of)

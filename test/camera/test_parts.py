@@ -97,7 +97,7 @@ def test_a_lens_is_reported_with_the_deviation_of_each_number() -> None:
     assert made.lines() == ['focal length 1000.0 ± 1.0, 1001.0 ± 2.0 px', 'centre 320.0 ± 3.0, 240.0 ± 4.0 px']
 
 
-def test_each_image_that_does_not_show_the_board_is_reported_with_the_reason() -> None:
+def test_image_without_board_is_reported_with_reason() -> None:
     images = [('a', np.zeros((48, 64), np.uint8)), ('b', np.zeros((50, 60), np.uint8)), ('c', None)]
     with pytest.raises(ConfigError, match=r'0 images show the board') as caught:
         calibrated(CameraSettings(target='charuco'), images)
@@ -116,7 +116,7 @@ def test_a_board_has_up_to_a_thousand_columns(columns: int, right: bool) -> None
 
 
 @pytest.mark.parametrize(('thick', 'why'), [(1, Status.MISSING), (2, Status.OBLIQUE)])
-def test_three_scratches_a_pixel_wide_are_no_target_observed_obliquely(thick: int, why: Status) -> None:
+def test_three_thin_scratches_are_no_oblique_target(thick: int, why: Status) -> None:
     """They have its spacing: 36 px, of half-widths of 10 to 12 px."""
     grey = np.full((40, 130), 20, dtype=np.uint8)
     for middle in (24, 60, 96):
@@ -127,7 +127,7 @@ def test_three_scratches_a_pixel_wide_are_no_target_observed_obliquely(thick: in
 
 
 @pytest.mark.parametrize(('rest_frames', 'last'), [(0, 400), (30, 400), (300, 600)])
-def test_a_rest_that_does_not_come_is_given_up_behind_as_many_frames(rest_frames: int, last: int) -> None:
+def test_camera_rest_is_given_up_after_bounded_frames(rest_frames: int, last: int) -> None:
     """Frames of which one is good, and twenty or as many as are asked for would be a rest."""
     still = TargetPose(np.eye(3), np.array([0.0, 0.0, 1.0]), 1e-12 * np.eye(6), 0.0, 10, np.zeros((3, 2)))
     target = SimpleNamespace(locate=lambda *_: still, set_rest=lambda _: None)

@@ -54,7 +54,7 @@ def test_covariance_is_that_of_small_changes_of_rest_and_pose(keystone: list[flo
     )
 
 
-def test_the_mean_of_frames_has_their_covariance_over_their_number() -> None:
+def test_mean_pose_has_frame_covariance_over_count() -> None:
     frames = [target(np.full(3, 0.01 * i), np.array([0.0, 0.0, 0.5 + 0.001 * i]), np.zeros(0), i) for i in range(4)]
     mean = mean_pose(frames)
     np.testing.assert_allclose(mean.covariance, sum(f.covariance for f in frames) / 16.0, rtol=1e-12)

@@ -38,7 +38,7 @@ def test_it_is_started_where_no_port_is_known(
     assert simulates_at_once(overrides, ros_arguments) is wanted
 
 
-def test_the_first_that_needs_one_takes_it_and_no_one_leaves_it_behind() -> None:
+def test_early_rig_is_taken_by_first_user_or_closed() -> None:
     with started_early(True):
         (process,) = WAITING
         rig = SimulatedRigProcess(load_rig())

@@ -107,7 +107,7 @@ def test_a_value_that_an_option_does_not_take_is_status_2(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('command', 'also'), [('convert', '.rrd'), ('replay', '.rrd .parquet'), ('simulate', '')])
-def test_a_recording_is_not_written_under_the_ending_of_something_else(
+def test_recording_name_of_foreign_suffix_is_rejected(
     command: str, also: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = [] if command == 'simulate' else [CLEAN]
@@ -151,7 +151,7 @@ def bad_from_row(folder: Path, row: int) -> Path:
 
 @pytest.mark.parametrize('name', ['out.csv', 'out.mcap', 'out'])
 @pytest.mark.parametrize('command', ['convert', 'replay'])
-def test_an_output_that_was_not_finished_does_not_pretend_to_be_whole(
+def test_unfinished_output_stays_partial(
     command: str, name: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = bad_from_row(folder, 2000)
@@ -252,9 +252,7 @@ def test_an_existing_output_is_not_moved(
     assert list(folder.iterdir()) == [out]
 
 
-def test_discover_leaves_no_folder_where_it_found_nothing_to_read(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_discover_without_input_leaves_no_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert rejected(capsys, 'discover', CLEAN, '--out', 'found')[0] == 4
     assert list(folder.iterdir()) == []
 
@@ -447,7 +445,7 @@ def reported() -> Iterator[tuple[Path, str]]:
                 yield path, n.value
 
 
-def test_micrometres_are_written_alike_wherever_somebody_reads_them() -> None:
+def test_micrometres_use_one_symbol_in_all_texts() -> None:
     # Names that scripts read, of columns and of keys of /diagnostics, are ASCII: `shift (um)`.
     wrong = [(path.name, text) for path, text in reported() if re.search(r'(?<![\w(])(um|urad)(?!\w)', text)]
     assert wrong == []

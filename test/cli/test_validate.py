@@ -71,7 +71,7 @@ def test_other_solvers_are_compared_if_asked(run: Path, capsys: pytest.CaptureFi
     assert "invalid choice: 'bean'" in capsys.readouterr().err
 
 
-def test_a_solver_that_cannot_solve_the_rig_is_reported_if_it_was_named(run: Path) -> None:
+def test_unsuitable_solver_is_reported_if_named(run: Path) -> None:
     # Both centres on one line through the middle.
     rig = load_rig(overrides={'psd_2.center': [0.0, -0.07]})
     assert 'appendix_d' not in psd_deflection.validate(run, rig=rig, solvers=['all']).agreements

@@ -291,9 +291,7 @@ def test_others_are_counted_and_reported_once(udp: Datagrammed) -> None:
     assert udp.port.describe()['datagrams of other senders'] == '6'
 
 
-def test_a_silent_sender_gives_way_to_another_device_but_not_to_junk(
-    udp: Datagrammed, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_sender_yields_to_device_not_to_junk(udp: Datagrammed, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(udp_port, 'time', SimpleNamespace(monotonic=lambda: now))
     device, stranger = udp.sender(), udp.sender()

@@ -108,7 +108,7 @@ def test_one_that_declares_another_name_is_rejected(tmp_path: Path, monkeypatch:
         find_device('other')
 
 
-def test_one_that_breaks_does_not_keep_the_others_from_being_found(
+def test_broken_plug_in_does_not_hide_other_devices(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install(tmp_path, monkeypatch, 'import a_package_that_is_not_there', f'{NAME} = my_package.converter:DEVICE')

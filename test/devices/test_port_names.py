@@ -54,7 +54,7 @@ def test_a_name(name: str, address: Address | None) -> None:
         ('socket://' + 'x' * 5000, 'must be socket'),
     ],
 )
-def test_a_name_that_cannot_be_says_key_value_and_what_is_allowed(name: str, message: str) -> None:
+def test_invalid_port_reports_key_value_and_bounds(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:
         make_source(load_rig(overrides={'port': name}))
     assert str(error.value).startswith(f'port = {name[:20]!r}'[:-1])
@@ -82,7 +82,7 @@ def test_a_device_that_must_be_asked_is_not_looked_for_over_udp() -> None:
             make_source(load_rig(overrides={'source': source, 'port': port, **ten_volts}))
 
 
-def test_a_port_of_the_network_is_no_pattern_and_is_looked_for_nowhere_else() -> None:
+def test_network_port_is_no_pattern_without_candidates() -> None:
     assert not is_pattern('socket://[::1]:4000')
     assert is_pattern('/dev/ttyACM[01]')
     assert candidate_ports('socket://rig:4000', 'T-1') == []

@@ -25,7 +25,7 @@ def test_a_device_has_the_name_that_it_is_listed_by(name: str) -> None:
     assert device.help
 
 
-def test_the_registry_imports_no_device_and_a_device_no_simulation() -> None:
+def test_registry_import_loads_no_device_or_simulation() -> None:
     code = (
         'import sys, psd_deflection.devices.registry as registry\n'
         'print([m for m in registry.DEVICES.values() if m in sys.modules], "serial" in sys.modules)\n'
@@ -38,7 +38,7 @@ def test_the_registry_imports_no_device_and_a_device_no_simulation() -> None:
 
 
 @pytest.mark.parametrize('name', [n for n in DEVICES if find_device(n).probe is not None])
-def test_a_simulated_device_is_recognised_and_its_suggestion_makes_a_rig(
+def test_simulated_device_probe_suggests_its_rig(
     name: str, served: Any, unloaded: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Each of them answers: however late, it is waited for.

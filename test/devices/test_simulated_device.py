@@ -61,7 +61,7 @@ def samples(stream: bytes) -> list[SampleFrame]:
     return [f for f in frames(stream) if isinstance(f, SampleFrame)]
 
 
-def test_a_sample_each_millisecond_of_its_clock_and_hello_and_status_once_a_second() -> None:
+def test_device_sends_samples_at_1khz_and_hello_at_1hz() -> None:
     got = frames(device().take(2500 * MS, room=1 << 30))
     taken = [f for f in got if isinstance(f, SampleFrame)]
     assert [f.seq for f in taken] == list(range(2501))
@@ -169,7 +169,7 @@ def test_a_link_replaces_a_link_and_nothing_else(tmp_path: Path) -> None:
     assert not (tmp_path / 'port').is_symlink()
 
 
-def test_the_ports_of_a_pair_have_links_of_their_own_and_all_go_when_one_cannot_be_made(tmp_path: Path) -> None:
+def test_pair_ports_have_own_links_and_fail_together(tmp_path: Path) -> None:
     assert link_names('rig', 1) == ['rig']
     assert link_names(None, 2) == [None, None]
     links = link_names(str(tmp_path / 'rig'), 2)
@@ -198,7 +198,7 @@ def test_a_converter_of_24_bits_sends_wide_samples_and_says_so() -> None:
     assert len(np.unique(volts[:, 0])) > 450
 
 
-def test_a_converter_of_12_bits_is_over_range_at_its_own_last_step() -> None:
+def test_twelve_bit_converter_saturates_at_last_step() -> None:
     rig = load_rig(overrides={'converter.bits': 12, 'amplifier.sum_nominal': 20.0})
     got = samples(SimulatedFrames(RigFeed(rig, no_load)).take(5 * MS, room=1 << 30))
     assert {f.counts[2] for f in got} == {2047}

@@ -154,7 +154,7 @@ def test_times_of_the_host_are_moved_to_ros_time_by_one_constant() -> None:
     assert abs(int(taken[0]) - (time.time_ns() - time.monotonic_ns())) < 10**9
 
 
-def test_a_device_without_numbers_that_comes_back_starts_a_new_block() -> None:
+def test_device_without_numbers_returns_in_new_block() -> None:
     script: list[list[Any] | Exception] = [
         [Sample(0, i, i * 1000, VOLTS) for i in range(30)],
         PortClosedError('scripted: gone'),
@@ -170,7 +170,7 @@ def test_a_device_without_numbers_that_comes_back_starts_a_new_block() -> None:
     assert source.calls == ['open', 'start', 'close', 'open', 'start', 'close']
 
 
-def test_a_source_whose_device_fails_is_waited_for_as_one_that_is_gone() -> None:
+def test_failing_device_is_waited_for_like_lost_port() -> None:
     acquisition = acquisition_of([DeviceError('scripted: says nothing we know'), [Sample(0, 0, 0, VOLTS)]])
     assert len(chunks(run(acquisition))) == 1
     assert acquisition.counters.disconnects == 1

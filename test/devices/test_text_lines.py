@@ -133,7 +133,7 @@ def test_micros_wraps_and_restarts_with_the_device() -> None:
     assert got == [2**32 - 1000, 2**32, 2**32 + 1000, 500, 1500]
 
 
-def test_micros_that_go_back_while_the_number_stands_still_start_again() -> None:
+def test_micros_going_back_at_same_number_is_a_restart() -> None:
     """As far back as a wrap: but a device that counts its samples does not count one for 71 minutes."""
     extender = TimeExtender()
     assert [extender.extend(Line(7, t, VALUES)) for t in (2**32 - 5, 3)] == [2**32 - 5, 3]
@@ -179,7 +179,7 @@ def test_a_line_that_comes_again_does_not_turn_back_the_clock(behind: int, earli
 
 
 @pytest.mark.parametrize(('seq', 'again'), [(64, False), (65, True)])
-def test_the_first_numbers_after_a_restart_are_no_lines_of_before(seq: int, again: bool) -> None:
+def test_first_numbers_after_restart_are_not_old_lines(seq: int, again: bool) -> None:
     extender = TimeExtender()
     for s, t in ((69, 2**32 - 1000), (70, 2**32 + 9000)):
         extender.extend(Line(s, t % 2**32, VALUES))
@@ -306,7 +306,7 @@ def test_electrodes_become_the_readings_of_a_divider(wired: Any) -> None:
     assert hello.info['volts_per_count'] is None
 
 
-def test_electrodes_in_counts_are_scaled_and_their_end_is_reported(wired: Any) -> None:
+def test_electrode_counts_are_scaled_with_over_range(wired: Any) -> None:
     scale = 10.0 / 2**15
     info = b'"electrodes": true, "volts_per_count": %r' % scale
     _, event = sent(wired, info, b'1,1000,32767,0,100,100,100,300,200,200')
@@ -317,7 +317,7 @@ def test_electrodes_in_counts_are_scaled_and_their_end_is_reported(wired: Any) -
 @pytest.mark.parametrize(
     ('info', 'line'), [(b'"serial": "a"', ELECTRODES), (b'"electrodes": true', b'1,1000,0,0,5,0,0,5')]
 )
-def test_a_line_must_have_as_many_readings_as_the_description_says(wired: Any, info: bytes, line: bytes) -> None:
+def test_wrong_number_of_readings_is_rejected(wired: Any, info: bytes, line: bytes) -> None:
     _, event = sent(wired, info, line)
     assert 'readings where the description says' in event.reason
 

@@ -181,7 +181,7 @@ def test_it_reads_the_rig_in_slots_of_its_rate(pair: Any, run: Any, volts: Any, 
     assert float(state['rate done (1/s)']) > 0
 
 
-def test_a_rate_out_of_reach_is_rejected_with_the_one_that_is_not(pair: Any) -> None:
+def test_unreachable_rate_is_rejected_with_limit(pair: Any) -> None:
     _, _, rig = pair(**{'converter.sample_rate_hz': 5000.0})
     with pytest.raises(DeviceError, match=r'gives \d+ readings/s, .* = 5000 is out of reach; set it to at most \d+'):
         make_source(rig).open(2.0)
@@ -223,7 +223,7 @@ def test_an_answer_that_does_not_come_is_counted(pair: Any) -> None:
     assert reading.events == [BadFrame('no answer in time', 0)]
 
 
-def test_a_port_that_goes_away_while_it_is_asked_is_a_port_that_is_gone(pair: Any) -> None:
+def test_port_lost_during_read_raises_port_closed(pair: Any) -> None:
     first, _, rig = pair()
     source = make_source(rig)
     source.open(2.0)

@@ -188,7 +188,7 @@ QUESTIONS = {
 """What newcomers looked for, and the words that answer it."""
 
 
-def test_what_newcomers_ask_is_answered_two_steps_from_the_readme() -> None:
+def test_newcomer_questions_are_answered_near_readme() -> None:
     first = linked(ROOT / 'README.md')
     near = first.union(*(linked(page) for page in first if page.suffix == '.md'))
     docs = ROOT / 'docs'

@@ -102,7 +102,7 @@ def carry(cache: Path, wheels: dict[str, bytes]) -> None:
         archive.writestr('somewhere/other.whl', b'not asked for')
 
 
-def test_the_site_gets_the_interpreter_the_wheels_and_our_modules(cache: Path, tmp_path: Path) -> None:
+def test_site_has_interpreter_wheels_and_own_modules(cache: Path, tmp_path: Path) -> None:
     site = tmp_path / 'site'
     pyodide_site.fill(site, cache)
     there = {path.name for path in (site / pyodide_site.FOLDER).iterdir()}

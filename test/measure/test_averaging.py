@@ -43,7 +43,7 @@ def test_a_block_in_one_piece_is_complete_at_once() -> None:
     assert cutter.add(*chunk_of([40, 58])) == []
 
 
-def test_a_lost_last_sample_is_not_waited_for_beyond_the_next_block() -> None:
+def test_lost_last_sample_is_awaited_one_block_only() -> None:
     cutter = BlockCutter(20)
     assert cutter.add(*chunk_of(list(range(19)))) == []
     (block,) = cutter.add(*chunk_of([20]))
@@ -81,7 +81,7 @@ def test_however_the_stream_is_cut_the_blocks_are_the_same(seq: list[int], cuts:
 
 
 @given(st.lists(st.integers(0, 19), unique=True, min_size=1).map(sorted), st.integers(0, 10**6))
-def test_the_middle_of_a_block_does_not_depend_on_which_samples_are_there(slots: list[int], index: int) -> None:
+def test_block_middle_is_independent_of_lost_samples(slots: list[int], index: int) -> None:
     seq = np.array(slots, np.int64) + 20 * index
     block = SampleBlock(index, seq, seq * 1_000_000, np.zeros((len(seq), 6), np.float32), np.zeros(len(seq), np.uint8))
     assert block_middle_ns(block, 20, 1e6) == (20 * index) * 1_000_000 + 9_500_000

@@ -35,7 +35,7 @@ def test_without_a_temperature_and_a_time_nothing_has_drifted() -> None:
 
 
 @pytest.mark.parametrize('psd', [1, 2])
-def test_the_light_of_a_room_is_taken_off_with_the_sum_of_its_own_psd(psd: int) -> None:
+def test_ambient_light_is_removed_with_sum_of_its_psd(psd: int) -> None:
     """Of S + level at the centroid (S m + level c)/(S + level); without a sum S + level is the nominal 5 V."""
     light = correction({'name': 'ambient_light', 'psd': psd, 'level': 0.5, 'x': 1e-3, 'y': -2e-3})
     dots = np.array([[1e-4, 2e-4, 3e-4, 4e-4]])

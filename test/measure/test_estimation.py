@@ -72,7 +72,7 @@ def test_a_twist_that_is_taken_for_none_is_as_unsure_as_any() -> None:
     assert found.covariance[4] - found.covariance[0] == pytest.approx(0.1**2 * 0.02**2, rel=1e-9)
 
 
-def test_the_noise_of_a_zero_of_psds_at_the_base_is_that_of_the_rig_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zero_noise_of_base_psds_is_that_of_rig_file(monkeypatch: pytest.MonkeyPatch) -> None:
     base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
     want = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
     # Of the others it is that of a block's mean, as it was measured.
@@ -119,7 +119,7 @@ def test_the_chi_square_allows_for_what_a_calibration_left_open() -> None:
 
 @pytest.mark.parametrize('psd', [0, 1])
 @pytest.mark.parametrize('axis', [0, 1])
-def test_by_one_detector_a_zero_counts_along_its_axis_however_the_tip_is_turned(psd: int, axis: int) -> None:
+def test_zero_variance_of_single_psd_follows_rotation(psd: int, axis: int) -> None:
     """d = l - R(theta) (c + m): to C come s^2 of l, and v g g^T of the twist's variance v, g = -R'(theta) (c + m)."""
     theta = 0.3
     c, s = math.cos(theta), math.sin(theta)
@@ -143,7 +143,7 @@ def test_by_one_detector_a_zero_counts_along_its_axis_however_the_tip_is_turned(
     np.testing.assert_allclose(more[:2, :2], own + more[2, 2] * np.outer(g, g), rtol=1e-3, atol=1e-12)
 
 
-def test_what_a_calibration_left_open_is_reported_beside_the_noise() -> None:
+def test_calibration_covariance_is_reported_beside_noise() -> None:
     """``systematic`` is what the covariance holds besides noise, of the last estimate."""
     rig = {**calibrated(psd_1__zero_x=3e-6, psd_2__zero_y=2e-6), 'consistency': 'report', 'solvers': ['exact']}
     covariances = []
@@ -160,7 +160,7 @@ def test_what_a_calibration_left_open_is_reported_beside_the_noise() -> None:
     assert reported[0, 0] > 1e-12
 
 
-def test_a_reading_that_contradicts_the_others_widens_the_covariance() -> None:
+def test_inconsistent_reading_widens_covariance() -> None:
     volts = at_rest(1)
     volts[:, 0] = 1e-3 / 5e-4
     (widened,), (reported,) = (estimates(volts, {'consistency': c}) for c in ('widen', 'report'))
@@ -170,7 +170,7 @@ def test_a_reading_that_contradicts_the_others_widens_the_covariance() -> None:
     assert max(np.abs(reported.pose) / np.sqrt(np.array(reported.covariance)[[0, 4, 8]])) > 100.0
 
 
-def test_four_readings_that_contradict_each_other_are_rejected_if_that_is_asked_for() -> None:
+def test_inconsistent_readings_are_rejected_on_request() -> None:
     volts = at_rest(1)
     volts[:, 0] = 1e-3 / 5e-4
     records = list(Pipeline(load_rig(overrides={'consistency': 'reject'})).process(chunk(volts)))

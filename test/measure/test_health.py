@@ -67,7 +67,7 @@ def test_off_is_the_default_and_nothing_is_estimated() -> None:
 
 @pytest.mark.parametrize('psd', [1, 2])
 @pytest.mark.parametrize('rule', ['hold', 'zero'])
-def test_with_one_laser_lost_the_translation_goes_on_by_the_rule_and_returns(psd: int, rule: str) -> None:
+def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
     rig = load_rig(overrides={'degraded': rule})
     pipeline = Pipeline(rig)
     records = records_of(pipeline, dark(moving(40), psd, slice(10, 30)))
@@ -101,7 +101,7 @@ def test_with_one_laser_lost_the_translation_goes_on_by_the_rule_and_returns(psd
     assert pipeline.zero() is None
 
 
-def test_what_is_saturated_is_reported_with_the_parameter_of_the_range() -> None:
+def test_saturation_is_reported_with_range_parameter() -> None:
     counts = moving(1)
     counts[3, 2] = 32767
     (spot, *_) = [r for r in records_of(Pipeline(load_rig()), counts) if isinstance(r, SpotMeans)]
@@ -114,7 +114,7 @@ def test_what_is_saturated_is_reported_with_the_parameter_of_the_range() -> None
 # ---- findings
 
 
-def test_a_detector_that_stands_still_is_reported_and_rejected_where_it_shall_be() -> None:
+def test_frozen_detector_is_reported_or_rejected() -> None:
     counts = moving(12)
     counts[2 * SIZE : 10 * SIZE, 0:3] = counts[2 * SIZE, 0:3]
     quiet = Pipeline(load_rig())
@@ -184,7 +184,7 @@ def half_lit() -> Counts:
     return counts
 
 
-def test_with_the_splitter_one_laser_lost_is_reported_and_not_fatal(half_lit: Counts) -> None:
+def test_laser_loss_with_splitter_is_not_fatal(half_lit: Counts) -> None:
     spot, estimate = findings_of(load_rig(overrides={'splitter': True}), half_lit)
     assert spot.status is BlockStatus.OK
     assert spot.findings == ('one of the two lasers is out: half the light on both detectors',)
@@ -198,7 +198,7 @@ def test_with_the_splitter_one_laser_lost_is_reported_and_not_fatal(half_lit: Co
     assert findings_of(load_rig(), half_lit)[0].status is BlockStatus.LASER_LOST
 
 
-def test_a_change_of_the_rule_while_it_runs_holds_from_the_next_block() -> None:
+def test_degraded_rule_change_applies_from_next_block() -> None:
     pipeline = Pipeline(load_rig())
     counts = dark(moving(20), 1, slice(5, 15))
     first = primaries(records_of(pipeline, counts[: 10 * SIZE]))

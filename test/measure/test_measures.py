@@ -45,7 +45,7 @@ def bits(value: object) -> object:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ['clean', 'lost_samples', 'laser_off', 'motion', 'calibrated', 'three_psds'])
-def test_a_golden_recording_in_chunks_of_any_size_has_the_same_bits(name: str) -> None:
+def test_golden_bits_are_same_for_any_chunk_size(name: str) -> None:
     recording = open_recording(BAGS / name)
     columns = zip(*[(b.seq, b.t_ns, b.volts, b.flags) for b in recording.blocks()], strict=True)
     seq, t_ns, volts, flags = (np.concatenate(column) for column in columns)
@@ -57,7 +57,7 @@ def test_a_golden_recording_in_chunks_of_any_size_has_the_same_bits(name: str) -
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_blocks_by_chance_have_the_same_bits_one_by_one_and_together(seed: int) -> None:
+def test_random_blocks_have_same_bits_in_any_batch(seed: int) -> None:
     """Losses, dark lasers, tones, more noise, a constant detector and a flag; two, three and four PSDs."""
     rng = np.random.default_rng(seed)
     more = {f'psd_{n}.center': [0.03 * n, -0.05] for n in range(3, 3 + seed % 3)}

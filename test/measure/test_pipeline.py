@@ -119,7 +119,7 @@ REST = (0.0, 0.0, 0.0)
         ('x1 at the rail', lambda c: c.__setitem__((slice(None), 0), 32767), BlockStatus.SATURATED, 'x1'),
     ],
 )
-def test_a_block_that_cannot_be_trusted_has_no_estimate_and_says_why(
+def test_untrusted_block_has_no_estimate_but_a_reason(
     rig: Rig, label: str, change: object, status: BlockStatus, message: str
 ) -> None:
     counts = still(REST, 20, 0)
@@ -139,7 +139,7 @@ def test_the_device_flag_over_range_is_believed(rig: Rig) -> None:
     assert spots_of(run(Pipeline(rig).process, chunk)).status is BlockStatus.SATURATED
 
 
-def test_zero_takes_the_present_dots_and_applies_from_the_next_block_on(rig: Rig) -> None:
+def test_zero_takes_present_dots_from_next_block(rig: Rig) -> None:
     pipeline = Pipeline(rig)
     assert pipeline.zero() is None
     pose = (1e-4, -2e-4, 1e-3)
@@ -215,7 +215,7 @@ def test_an_effect_in_the_rig_file_is_simulated_and_corrected(rig: Rig, effect: 
     ],
     ids=lambda e: str(e['name']) if isinstance(e, dict) else '',
 )
-def test_a_drift_in_the_rig_file_is_corrected_and_replayed_to_the_bit(
+def test_drift_in_rig_file_is_corrected_in_replay_too(
     rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str], effect: dict[str, object], words: list[str]
 ) -> None:
     model = tmp_path / 'model.yaml'
@@ -357,7 +357,7 @@ def test_an_acceleration_is_there_after_the_last_block(rig: Rig) -> None:
 
 
 @pytest.mark.slow
-def test_what_drifts_is_taken_off_by_time_and_temperature_as_far_as_they_are_known() -> None:
+def test_known_drift_with_time_and_heat_is_removed() -> None:
     """A beam wanders by 1 mm/s, a PSD by 5 um/K: of readings that do so, a tip at rest is left."""
     values = {
         'effects.a.name': 'laser_pointing_drift',
@@ -405,7 +405,7 @@ def test_a_zero_reaches_back_over_half_a_second_without_samples(rig: Rig, index:
     assert dict(change.values)['psd_1.zero'] == pytest.approx((1.5e-6 if blocks == 2 else 2e-6, 0.0), abs=1e-10)
 
 
-def test_the_filter_begins_anew_with_a_zero_and_with_nothing_else() -> None:
+def test_filter_restarts_with_zero_only() -> None:
     pipeline = Pipeline(load_rig(overrides={'filter': 'modal'}))
     first = pipeline.motion_filter
     pipeline.change({'sum_min': 0.5})
@@ -433,7 +433,7 @@ def test_what_is_reported_of_a_block(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(('size', 'every'), [(1, 20), (5, 4), (20, 3)])
-def test_with_decimation_each_block_has_its_estimate_and_one_of_so_many_the_rest(size: int, every: int) -> None:
+def test_decimation_keeps_estimates_and_thins_the_rest(size: int, every: int) -> None:
     counts = still((1e-4, -2e-4, 1e-3), 240 * size, 1)
     names = [DEFLECTION, DEFLECTION_WITH_COVARIANCE, SAMPLES, WRENCH, '/psd_1/spot', '/psd_2/spot']
     names += ['/link_tip/exact/deflection', '/link_tip/wls/deflection', '/link_tip/iterative/deflection']
@@ -457,9 +457,7 @@ def test_with_decimation_each_block_has_its_estimate_and_one_of_so_many_the_rest
 
 
 @pytest.mark.slow
-def test_a_recording_with_decimation_is_replayed_bit_for_bit_with_as_many_messages(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_decimated_recording_replays_bit_for_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = tmp_path / 'rig.yaml'
     model.write_text('/**:\n  ros__parameters:\n    block_size: 5\n    decimation: 4\n')
     bag = tmp_path / 'each_fifth'
@@ -472,7 +470,7 @@ def test_a_recording_with_decimation_is_replayed_bit_for_bit_with_as_many_messag
 
 
 @pytest.mark.parametrize(('size', 'lost', 'status'), [(1, 0, 'OK'), (4, 1, 'TOO_FEW_SAMPLES'), (20, 10, 'OK')])
-def test_a_block_smaller_than_the_least_number_of_samples_needs_all_of_them(size: int, lost: int, status: str) -> None:
+def test_block_below_min_samples_needs_all_its_samples(size: int, lost: int, status: str) -> None:
     pipeline = Pipeline(load_rig(overrides={'block_size': size}))
     chunk = chunk_of(still((0.0, 0.0, 0.0), size - lost, 2))
     records = [*pipeline.process(chunk), *pipeline.flush()]

@@ -34,7 +34,7 @@ def observe_usb(
 
 
 @pytest.mark.parametrize('skew', [30.0, -83.0])
-def test_stamps_follow_the_truth_within_50_us_after_three_minutes(skew: float) -> None:
+def test_stamps_are_within_50_us_after_three_minutes(skew: float) -> None:
     clock = ClockMap()
     stamps, truth = observe_usb(clock, 240, skew, 1)
     error = (stamps - truth)[180 * 50 :]
@@ -47,7 +47,7 @@ def test_stamps_follow_the_truth_within_50_us_after_three_minutes(skew: float) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize('skew', [500.0, -500.0, 5000.0, -5000.0])
-def test_a_clock_far_off_its_rate_is_followed_within_twenty_seconds(skew: float) -> None:
+def test_clock_far_off_rate_is_followed_within_20_s(skew: float) -> None:
     clock = ClockMap()
     stamps, truth = observe_usb(clock, 40, skew, 1)
     error = stamps - truth
@@ -158,9 +158,7 @@ def test_the_last_five_minutes_count_and_no_more() -> None:
 
 @pytest.mark.parametrize('ahead', [0, 3_600_000 * MS])
 @pytest.mark.parametrize(('ppm', 'seconds'), [(600.0, 5), (-600.0, 5), (2000.0, 3), (150.0, 10), (-30.0, 10)])
-def test_a_clock_is_fitted_early_as_soon_as_it_has_run_off_by_two_milliseconds(
-    ppm: float, seconds: int, ahead: int
-) -> None:
+def test_clock_off_by_two_milliseconds_is_fitted_early(ppm: float, seconds: int, ahead: int) -> None:
     """600 ppm take 4 s from the first of five minima to the last; fewer than three show no rate. Ten always do."""
     clock = ClockMap()
     for k in range(12 * 100):
@@ -201,7 +199,7 @@ def test_how_fast_a_map_draws_near(second_us: int, slope: float, up_us: int) -> 
     assert clock.host_ns(up_us + 20_000_000) == pytest.approx(20_007 * MS + slope * 20e9, abs=2, rel=0)
 
 
-def test_the_same_time_again_is_no_jump_but_for_one_that_comes_too_early() -> None:
+def test_repeated_time_is_no_jump_unless_early() -> None:
     clock = ClockMap()
     clock.observe(1000, 100 * MS)
     assert not clock.observe(1000, 110 * MS)
@@ -256,7 +254,7 @@ def test_the_map_turns_at_the_last_stamp() -> None:
     assert [clock.host_ns(20_000 + us) for us in (0, 1000)] == [stamps[-1], stamps[-1] + MS - 2000]
 
 
-def test_of_all_lines_below_the_points_the_lower_line_is_nearest_to_them() -> None:
+def test_lower_line_is_closest_of_lines_below_points() -> None:
     rng = np.random.default_rng(8)
     for _ in range(100):
         x = rng.choice(50, int(rng.integers(2, 9)), replace=False)
@@ -282,9 +280,7 @@ def test_a_sample_fifty_milliseconds_early_is_a_jump(early_ns: int, jumped: bool
 
 
 @pytest.mark.parametrize(('off_ns', 'jumped'), [(49_999_999, False), (50_000_000, True)])
-def test_a_clock_that_agrees_with_the_numbers_within_fifty_milliseconds_has_not_jumped(
-    off_ns: int, jumped: bool
-) -> None:
+def test_clock_within_50_ms_of_numbers_has_not_jumped(off_ns: int, jumped: bool) -> None:
     for sign in (1, -1):
         clock = ClockMap()
         clock.observe(0, 1000 * MS)

@@ -161,7 +161,7 @@ def test_a_load_that_is_noted_again_changes_nothing() -> None:
     assert fed.watch.alarm.channel == 'x1'
 
 
-def test_the_base_line_may_be_wrong_by_two_thousandths_of_a_movement() -> None:
+def test_base_line_tolerance_is_0_2_percent_of_motion() -> None:
     """A link that moved by 2 mm, without a known load: 3 um are a sound rig's, 9 um are not."""
     for wrong, alarm in ((1.5e-6, False), (6e-6, True)):
         fed = Fed()
@@ -212,7 +212,7 @@ def test_each_base_line_of_three_psds_is_watched(a: int, b: int) -> None:
 
 
 @pytest.mark.parametrize(('share', 'alarm'), [(1.01, False), (1.06, True)])
-def test_a_torque_must_do_what_the_link_model_says_from_one_to_the_other(share: float, alarm: bool) -> None:
+def test_torque_response_off_link_model_raises_alarm(share: float, alarm: bool) -> None:
     """Two per cent of the movement, which is from one side to the other, and 40 urad."""
     fed = Fed()
     fed.load(0.0, 0.0, 10.0)

@@ -95,7 +95,7 @@ def test_quaternion_is_the_rotation_of_the_contract(theta: float, phi: float, om
 
 
 @pytest.mark.parametrize('length', [0.1, 10.0])
-def test_a_quaternion_of_any_length_has_the_angles_of_its_direction(length: float) -> None:
+def test_quaternion_angles_are_independent_of_length(length: float) -> None:
     q = {k: length * v for k, v in quaternion(0.3, -0.2, 0.1).items()}
     assert angles(q) == pytest.approx((0.3, -0.2, 0.1), abs=1e-14)
 
@@ -210,7 +210,7 @@ def test_an_estimated_load_is_no_input() -> None:
         from_fields(m.topic, m.fields)
 
 
-def test_an_independent_decoder_reads_every_message_as_the_fields_say() -> None:
+def test_independent_decoder_reads_every_message_alike() -> None:
     observed = set()
     for record in run(60):
         for m in to_messages(record):
@@ -248,7 +248,7 @@ def test_an_independent_decoder_reads_the_samples_of_a_block(flags: int) -> None
         np.testing.assert_array_equal(points[c], given_block.volts[:, i])
 
 
-def test_seq_is_recorded_modulo_2_to_the_32_with_what_is_above_beside_it() -> None:
+def test_seq_is_recorded_modulo_2_to_32_with_high_part() -> None:
     start = 2**32 // 20
     (m,) = to_messages(block(start, first_index=start))
     _, points = point_cloud2.to_points(m.fields)
@@ -378,7 +378,7 @@ def test_no_covariance_stands_anywhere_else() -> None:
     assert k.tolist() == np.diag([0.0, 0.0, 1e6, 1e6, 1e6, 0.0]).tolist()
 
 
-def test_an_end_effector_has_its_whole_pose_in_the_frame_of_its_chain() -> None:
+def test_end_effector_has_full_pose_in_chain_frame() -> None:
     e = EndEffectorDeflection(T0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3, 0.9), tuple(map(float, range(36))))
     fields = pose_with_covariance_stamped.from_end_effector(e, 'arm')
     assert (stamp_ns(fields), fields['header']['frame_id']) == (T0, 'arm')
@@ -512,7 +512,7 @@ def test_an_independent_decoder_reads_the_rig() -> None:
     assert string.to_rig(cdr.decode(m.type, raw)) == state
 
 
-def test_a_rig_of_read_only_maps_is_written_and_one_of_anything_else_is_not() -> None:
+def test_rig_of_read_only_maps_is_written_sets_are_not() -> None:
     frozen = MappingProxyType({'psd_1.zero': [0.1, 0.2], 'nested': MappingProxyType({'a': 1})})
     (m,) = to_messages(RigState(5, 7, frozen, None, {}, '1'))
     assert json.loads(m.fields['data'])['parameters'] == {'psd_1.zero': [0.1, 0.2], 'nested': {'a': 1}}
@@ -575,7 +575,7 @@ def test_fields_that_cannot_be_read_are_passed_over(more: dict[str, object]) -> 
     assert np.zeros(1, kinds)['seq'].dtype == np.dtype('<u4')
 
 
-def test_a_field_may_end_with_the_point_and_a_point_has_64_kib_at_most() -> None:
+def test_field_may_end_with_point_and_point_has_64_kib() -> None:
     for offset, fits in ((44, True), (45, False)):
         more = {'name': 'x', 'offset': offset, 'datatype': 7, 'count': 1}
         if fits:

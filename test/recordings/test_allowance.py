@@ -139,7 +139,7 @@ def test_a_small_file_causes_little_work(crafted: Path, monkeypatch: pytest.Monk
     assert not recording.complete
 
 
-def test_a_file_that_unpacks_to_gigabytes_is_rejected_once_with_its_bound(tmp_path: Path) -> None:
+def test_file_unpacking_to_gigabytes_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     path.write_bytes(MAGIC + chunk(record(0x90, bytes(60_000_000))) * 100)
     recording = BagRecording(path)
@@ -191,7 +191,7 @@ def test_a_record_of_gigabytes_is_not_read(tmp_path: Path, opcode: int) -> None:
     assert f'has {2**31} bytes and is left out' in recording.warnings[-1]
 
 
-def test_a_cloud_of_too_many_fields_is_rejected_before_it_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cloud_of_too_many_fields_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
     field = {'name': 'x', 'offset': 0, 'datatype': 7, 'count': 1}
     message = cdr.encode(
         'sensor_msgs/msg/PointCloud2',

@@ -122,7 +122,7 @@ def test_chunks_are_zstd_with_crc_and_span_less_than_a_second(tmp_path: Path) ->
     assert chunks >= 4
 
 
-def test_the_index_of_a_long_recording_is_whole_and_does_not_wait_in_memory(tmp_path: Path) -> None:
+def test_index_of_long_recording_is_complete(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     with McapFile(path, rig_values={}) as out:
         for number in range(300):

@@ -102,7 +102,7 @@ def test_a_type_that_is_not_ours_is_rejected() -> None:
         cdr.encode('std_msgs/msg/Empty', {})
 
 
-def test_a_constant_array_is_written_as_any_other_wherever_it_begins() -> None:
+def test_constant_array_encodes_alike_at_any_offset() -> None:
     fields = [
         {'name': 'seq', 'offset': 0, 'datatype': 6, 'count': 1},
         {'name': 'x', 'offset': 4, 'datatype': 7, 'count': 1},

@@ -24,7 +24,7 @@ def changed(by: float, name: str = 'x') -> dict[str, dict[str, float]]:
     return {**POSE, 'position': {**POSE['position'], name: POSE['position'][name] + by}}
 
 
-def test_numbers_agree_within_a_thousand_millionth_of_the_largest_of_their_vector() -> None:
+def test_numbers_agree_within_1e_9_of_largest() -> None:
     assert agree(POSE, changed(1.9e-12), 1e-13)
     assert agree(POSE, changed(1.9e-12, 'z'), 1e-13)
     assert not agree(POSE, changed(2.1e-12), 1e-13)
@@ -78,7 +78,7 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
 
 
 @pytest.mark.slow
-def test_rounding_of_another_version_is_reported_and_is_no_failure(
+def test_rounding_of_other_version_is_no_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9', 'numpy': '1.25.0'})
@@ -111,7 +111,7 @@ def test_another_difference_of_another_version_is_a_failure(
     assert 'by rounding alone, ' in capsys.readouterr().out
 
 
-def test_a_recording_says_what_computed_it_in_its_metadata_and_in_its_messages(
+def test_recording_names_its_provenance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = recorded(tmp_path, monkeypatch, {'psd_deflection': '7', 'numpy': '8', 'processor': 'a\x1b[2Jb'})

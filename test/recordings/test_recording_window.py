@@ -211,7 +211,7 @@ def two_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.mark.repeatable
 @pytest.mark.parametrize('name', [name for name in COMMANDS if {'--from', '--json'} <= parted(name)])
-def test_the_answer_of_a_part_is_that_of_a_file_with_the_part_alone(
+def test_answer_of_window_equals_that_of_cut_file(
     name: str,
     two_files: tuple[Path, Path],
     tmp_path: Path,
@@ -270,7 +270,7 @@ def test_several_recordings_are_replayed_in_the_same_part(capsys: pytest.Capture
     assert [json.loads(line)['samples'] for line in capsys.readouterr().out.splitlines()] == [1000, 973]
 
 
-def test_what_comes_before_the_memory_of_a_run_is_reported_cannot_be_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window_before_state_message_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recorder that joins late hears of the memory some seconds later."""
     opened = psd_deflection.open(BAGS / 'clean')
     start = int(next(opened.blocks()).t_ns[0])
@@ -282,7 +282,7 @@ def test_what_comes_before_the_memory_of_a_run_is_reported_cannot_be_compared(mo
     ReplayComparison(opened, RecordingWindow(opened, 0.5, 2.5))
 
 
-def test_the_page_plays_a_part_of_a_recording_and_no_part_of_a_rig(capsys: pytest.CaptureFixture[str]) -> None:
+def test_monitor_window_is_for_recordings_only(capsys: pytest.CaptureFixture[str]) -> None:
     assert make_parser(['monitor']).parse_args(['monitor', 'run', '--from', '1', '--to', '3']).span == (1.0, 3.0)
     assert main(['monitor', '--from', '1']) == 2
     assert '--from and --to are for a recording' in capsys.readouterr().err

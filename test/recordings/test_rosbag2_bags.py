@@ -232,7 +232,7 @@ def test_of_several_rigs_one_is_chosen(run: Path, tmp_path: Path, capsys: pytest
         next(open_recording(two, namespace='/up').blocks())
 
 
-def test_a_remapped_topic_of_samples_is_found_and_a_foreign_cloud_is_not(run: Path, tmp_path: Path) -> None:
+def test_remapped_samples_are_found_and_no_foreign_cloud(run: Path, tmp_path: Path) -> None:
     bag = passed_on(run, tmp_path / 'remapped', lambda topic: '/raw/psd/samples' if topic == SAMPLES else topic)
     recording = open_recording(bag)
     assert recording.namespace == '/raw'

@@ -34,7 +34,7 @@ def series(n: int = 3) -> EstimateSeries:
     )
 
 
-def test_each_axis_of_a_series_is_its_own_column_from_the_first_estimate_on() -> None:
+def test_series_axes_are_columns_from_first_estimate() -> None:
     made = series()
     assert made.t == pytest.approx([0.0, 0.02, 0.04])
     assert [made.dx[1], made.dy[1], made.theta[1]] == pytest.approx([3e-6, 4e-6, 5e-6])
@@ -87,7 +87,7 @@ def test_loads_are_held_and_references_stand_once() -> None:
     np.testing.assert_array_equal(warm, [np.nan, np.nan, np.nan, 21.5])
 
 
-def test_a_mark_that_is_there_twice_is_the_one_after_the_beginning() -> None:
+def test_repeated_mark_is_the_first_after_the_start() -> None:
     marks = [Mark(START + t, text) for t, text in ((5, 'on'), (9, 'off'), (20, 'on'), (30, 'off'))]
     recording = cast(Any, SimpleNamespace(path=Path('x'), marks=lambda: marks))
     assert span_ns(recording, START, ('mark:on', 'mark:on')) == (START + 5, START + 20)

@@ -36,7 +36,7 @@ def records_of(world: Rig, known: Rig) -> tuple[list[DeflectionEstimate], list[S
     return [r for r in out if isinstance(r, DeflectionEstimate)], [r for r in out if isinstance(r, SampleBlock)]
 
 
-def test_there_are_128_wirings_of_two_detectors_and_each_is_undone() -> None:
+def test_two_detectors_have_128_invertible_wirings() -> None:
     assert len(set(WIRINGS)) == 128
     assert [w for w in WIRINGS if w.nominal] == [Wiring()]
     volts = np.arange(1, 13, dtype=np.float32).reshape(2, 6)
@@ -50,7 +50,7 @@ def test_there_are_128_wirings_of_two_detectors_and_each_is_undone() -> None:
 
 
 @pytest.mark.parametrize('wiring', [WIRINGS[1], WIRINGS[22], WIRINGS[77], WIRINGS[127]], ids=str)
-def test_a_rig_file_that_knows_the_wiring_gives_the_estimates_of_the_nominal_rig(wiring: Wiring) -> None:
+def test_rig_file_with_wiring_gives_nominal_estimates(wiring: Wiring) -> None:
     nominal, straight = records_of(load_rig(), load_rig())
     known = rig_from_values(values_of(wiring))
     wired, blocks = records_of(known, known)
@@ -62,7 +62,7 @@ def test_a_rig_file_that_knows_the_wiring_gives_the_estimates_of_the_nominal_rig
     assert mistaken != nominal
 
 
-def test_a_dark_detector_is_dark_on_the_input_that_it_is_wired_to() -> None:
+def test_dark_detector_is_dark_on_its_wired_input() -> None:
     rig = rig_from_values({'psds_exchanged': True})
     feed = RigFeed(rig, lambda first, n: np.zeros((n, 3)), dark=[(1, 0, 10)])
     _, _, sum1, _, _, sum2 = feed.next()

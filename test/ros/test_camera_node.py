@@ -70,9 +70,7 @@ def test_images_become_references_and_a_rejected_one_its_reason(domain: int, pee
 
 
 @pytest.mark.slow
-def test_a_parameter_that_is_set_acts_and_the_lens_is_found_beside_the_image(
-    domain: int, peer: Any, tmp_path: Path
-) -> None:
+def test_a_parameter_that_is_set_acts_with_lens_found(domain: int, peer: Any, tmp_path: Path) -> None:
     scene, rng = Scene(), np.random.default_rng(0)
     words = ('-r', 'image:=/cam/image_raw', '-p', 'rest.frames:=1')
     node = Program([*PSD_DEFLECTION, 'camera', '--ros-args', *words])

@@ -82,7 +82,7 @@ def test_end_effector_links_joints_zero_and_recording(chain: Program, peer: Any,
 
 
 @pytest.mark.slow
-def test_the_frames_lead_from_the_base_to_the_deflected_end_effector() -> None:
+def test_the_frames_lead_from_base_to_deflected_end() -> None:
     file = read_chain(EXAMPLE)
     tips = file.chain.tips_under(np.array([3.0, 5.0, -2.0]), file.angles)
     end = file.chain.compose([TipDeflection(t, np.eye(3)) for t in tips], file.angles)

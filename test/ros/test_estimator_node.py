@@ -306,7 +306,7 @@ def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., An
 
 
 @pytest.mark.slow
-def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start: Callable[..., Any], peer: Any) -> None:
+def test_second_rig_in_namespace_runs_at_stopped_clock(start: Callable[..., Any], peer: Any) -> None:
     pytest.importorskip('aiohttp')
     options = {'use_sim_time': True, 'markers': True, 'monitor': True, 'monitor_port': 0, 'monitor_control': True}
     arguments = [word for name, value in options.items() for word in ('-p', f'{name}:={str(value).lower()}')]

@@ -26,7 +26,7 @@ from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
 
 
 @pytest.mark.slow
-def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
+def test_velocity_and_filtered_pose_replay_bit_for_bit(
     start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     estimator = start('--port', simulated_port, '--ros-args', '-p', 'filter:=modal', '-p', f'bag_dir:={tmp_path}')

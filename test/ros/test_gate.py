@@ -154,7 +154,7 @@ def test_a_publisher_that_keeps_nothing_is_offered_no_latched_subscription(
     peer.until(lambda: heard('before'), 'what was kept')
 
 
-def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
+def test_unreliable_load_publisher_is_rejected_by_name(
     peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It holds until the next: a lost one would be a wrong label of all that follows."""

@@ -123,7 +123,7 @@ def test_a_stamp_that_is_no_time_is_rejected(topic: str) -> None:
 
 
 @pytest.mark.parametrize('topic', [LOAD, TEMPERATURE, ACCELERATION])
-def test_a_stamp_of_another_clock_is_rejected_but_that_of_a_reference(topic: str) -> None:
+def test_foreign_stamp_is_rejected_unless_of_reference(topic: str) -> None:
     seconds = NOW_NS // 10**9
     for away, rejected in ((0, False), (50, False), (-50, False), (70, True), (-70, True), (2**31 - 1 - seconds, True)):
         stamp = {'sec': seconds + away, 'nanosec': 0}

@@ -65,7 +65,7 @@ def messages_lost(bag: Path) -> int:
     return int(np.maximum(np.diff(blocks) - 1, 0).sum())
 
 
-def test_a_recorder_that_joins_a_running_node_replays_bit_for_bit(
+def test_late_recorder_of_node_replays_bit_for_bit(
     start: Callable[..., Any],
     peer: Any,
     simulated_port: str,

@@ -134,7 +134,7 @@ def value_of(peer: Any, name: str) -> Any:
 
 
 @pytest.mark.slow
-def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
+def test_parameters_set_unconfigured_are_kept(
     start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
 ) -> None:
     daemon = start(

@@ -52,7 +52,7 @@ def test_at_rest_the_beams_meet_the_detectors() -> None:
     assert (stamp.sec, stamp.nanosec) == (5, 7)
 
 
-def test_the_plate_goes_with_the_estimate_and_the_dot_stays_on_its_beam() -> None:
+def test_plate_follows_estimate_and_dot_stays_on_beam() -> None:
     dx, dy, theta = 1e-4, -2e-4, 1e-3
     bent = estimate(dx, dy, theta)
     c, s = math.cos(theta), math.sin(theta)

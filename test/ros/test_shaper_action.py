@@ -128,7 +128,7 @@ def begin(control_msgs: None, domain: int, peer: Peer) -> Iterator[Callable[...,
             arm.controller.close()
 
 
-def test_a_goal_is_shaped_and_its_result_is_that_of_the_controller(begin: Callable[..., Arm]) -> None:
+def test_goal_is_shaped_with_result_of_controller(begin: Callable[..., Arm]) -> None:
     arm = begin()
     goal = arm.goal()
     from control_msgs.msg import JointTolerance

@@ -50,7 +50,7 @@ def users() -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize('maker', MAKERS)
-def test_publishers_subscriptions_and_actions_are_made_from_rows_alone(maker: str) -> None:
+def test_publishers_and_actions_are_made_from_rows(maker: str) -> None:
     assert users()[maker] == {MAKERS[maker]}
 
 

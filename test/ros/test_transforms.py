@@ -125,7 +125,7 @@ def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer:
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec('tf2_msgs') is not None, reason='tf2_msgs is there')
-def test_without_tf2_msgs_the_node_says_that_there_are_no_frames_if_they_were_asked_for(
+def test_without_tf2_msgs_no_frames_are_reported(
     start: Callable[..., Any],
 ) -> None:
     unasked = start()

@@ -96,7 +96,7 @@ def test_joining_within_a_block_starts_with_the_next_block(device: Any, run: Run
     assert run.acquisition.counters.lost == 0
 
 
-def test_garbage_gaps_repeats_and_flags_are_counted_and_cost_nothing_else(device: Any, run: Run, sample: Any) -> None:
+def test_garbage_gaps_repeats_and_flags_are_counted(device: Any, run: Run, sample: Any) -> None:
     device.send_frames(*[sample(s) for s in range(5)])
     device.send(b'\x00garbage\x00\x05rubbish\x00')
     device.send_frames(sample(5), sample(5), sample(4), sample(9, flags=2), *[sample(s) for s in range(10, 20)])
@@ -280,9 +280,7 @@ def test_every_lost_sample_has_a_cause(device: Any, run: Run, sample: Any) -> No
     assert run.acquisition.counters.bad == 2
 
 
-def test_a_device_is_found_again_under_another_name_by_its_serial_number(
-    device: Any, tmp_path: Path, sample: Any
-) -> None:
+def test_renamed_device_is_recovered_by_serial_number(device: Any, tmp_path: Path, sample: Any) -> None:
     device.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'MINE'}))
     run = Run(load_rig(overrides={'port': str(tmp_path / 'port*'), 'serial_number': 'MINE'}))
     try:
@@ -316,7 +314,7 @@ def test_another_device_on_the_same_port_is_not_taken(device: Any, run: Run) -> 
     run.heard('the device is back')
 
 
-def test_a_wanted_serial_number_is_held_against_the_first_device_too(device: Any, rig: Rig) -> None:
+def test_wanted_serial_number_holds_for_first_device(device: Any, rig: Rig) -> None:
     with pytest.raises(DeviceError, match="serial number 'T-1' and not 'X'"):
         Acquisition(load_rig(overrides={'port': rig.acquisition.port, 'serial_number': 'X'}), texts(print)).open()
 

@@ -145,7 +145,7 @@ def test_a_command_that_reads_nothing_is_no_failure() -> None:
     assert (out.sent, stated) == (2, [])
 
 
-def test_a_web_address_is_tried_three_times_and_again_at_the_next_alarm(server: Server) -> None:
+def test_webhook_is_tried_three_times_for_each_alarm(server: Server) -> None:
     server.answers = [503, 500, 429, 503, 200]
     out, stated = forwarded('', server.url, times=2)
     assert len(server.got) == 5
@@ -156,7 +156,7 @@ def test_a_web_address_is_tried_three_times_and_again_at_the_next_alarm(server: 
 
 
 @pytest.mark.parametrize('answer', [302, 404])
-def test_what_no_repetition_mends_is_tried_once_and_no_redirection_is_followed(server: Server, answer: int) -> None:
+def test_permanent_error_or_redirection_is_tried_once(server: Server, answer: int) -> None:
     server.answers = [answer]
     out, _ = forwarded('', server.url)
     assert len(server.got) == 1

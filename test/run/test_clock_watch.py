@@ -29,7 +29,7 @@ def host_of(watched: ClockWatch, t_us: int) -> int:
     return int(watched.to_host_ns(np.array([t_us], np.int64))[0])
 
 
-def test_only_the_newest_sample_of_a_read_says_how_late_the_line_is() -> None:
+def test_only_newest_sample_of_read_sets_the_clock() -> None:
     watched = watch()
     assert not watched.newest([sample(0), sample(1), BadFrame('x', 3), sample(2), BadFrame('y', 1)], BOOT + 2 * MS)
     assert host_of(watched, 0) == BOOT
@@ -51,7 +51,7 @@ def test_samples_of_a_plug_in_count_as_frames_do() -> None:
     assert host_of(watched, 3000) == BOOT + 3 * MS
 
 
-def test_a_repeated_sample_and_one_whose_time_does_not_fit_its_number_are_not_shown() -> None:
+def test_repeated_or_implausible_sample_is_ignored() -> None:
     watched = watch()
     watched.newest([sample(100)], BOOT + 100 * MS)
     before = watched.state()
@@ -200,7 +200,7 @@ def test_times_that_need_no_map_go_through_as_they_are(t: int) -> None:
     assert watched.state().round_trip_ns is None
 
 
-def test_after_a_burst_of_ten_times_the_rate_the_clock_is_followed_again() -> None:
+def test_clock_recovers_from_burst_of_tenfold_rate() -> None:
     """Against the contract: the numbers run ahead of the time, a little at each sample."""
     watched = watch()
     seq = t_us = 0

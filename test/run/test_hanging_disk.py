@@ -152,7 +152,7 @@ def blocks_of(folder: Path) -> list[int]:
 
 
 @pytest.mark.parametrize('where', ['open', 'write', 'fsync'])
-def test_estimates_flow_while_the_disk_hangs_at_the_start_of_a_recording(live: Live, disk: Disk, where: str) -> None:
+def test_estimates_flow_while_disk_hangs_at_start(live: Live, disk: Disk, where: str) -> None:
     disk.hang(where)
     first = live.session.record(True)
     assert disk.is_reached()
@@ -196,7 +196,7 @@ def test_estimates_flow_while_the_disk_hangs_in_a_recording(live: Live, disk: Di
 
 
 @pytest.mark.slow
-def test_estimates_flow_while_the_disk_hangs_at_the_end_of_a_recording(live: Live, disk: Disk) -> None:
+def test_estimates_flow_while_disk_hangs_at_end(live: Live, disk: Disk) -> None:
     first = live.record(True)
     live.flow()
     disk.hang('close')
@@ -228,9 +228,7 @@ def test_stop_reports_a_recording_that_cannot_be_closed(
         live.session.record(False).result(WAIT_S)
 
 
-def test_a_recording_that_ends_by_itself_is_not_taken_for_one_that_runs(
-    live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_self_ended_recording_is_not_taken_for_running(live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(*_: object) -> None:
         raise KeyError('no such type')
 
@@ -279,7 +277,7 @@ def test_a_start_that_hangs_does_not_hold_up_the_end_of_the_run(live: Live, disk
 
 
 @pytest.mark.slow
-def test_starts_and_ends_without_end_on_a_disk_that_hangs_make_a_few_threads(live: Live, disk: Disk) -> None:
+def test_starts_and_stops_without_end_use_few_threads(live: Live, disk: Disk) -> None:
     disk.hang('open')
     before = threading.active_count()
     rejections = []
@@ -294,7 +292,7 @@ def test_starts_and_ends_without_end_on_a_disk_that_hangs_make_a_few_threads(liv
 
 @pytest.mark.slow
 @pytest.mark.parametrize('asked_for', [False, True])
-def test_an_end_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
+def test_recording_holds_up_the_end_for_limited_time(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch, asked_for: bool
 ) -> None:
     monkeypatch.setattr(recorder_module, 'JOIN_S', 0.01)
@@ -352,7 +350,7 @@ def test_a_disk_that_rejects_at_once_ends_the_start(device: ScriptedDevice, samp
     assert not one.session.processing.alive
 
 
-def test_a_recording_that_the_pipeline_does_not_take_leaves_nothing(tmp_path: Path) -> None:
+def test_recording_without_pipeline_leaves_nothing(tmp_path: Path) -> None:
     def busy(action: Callable[[], None]) -> None:
         raise TimeoutError('no data flows')
 
@@ -388,7 +386,7 @@ def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, disk: Disk, t
 
 
 @pytest.mark.slow
-def test_a_zero_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
+def test_zero_holds_up_the_end_for_limited_time(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(session_module, 'KEEP_S', 0.01)

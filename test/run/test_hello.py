@@ -221,7 +221,7 @@ def test_a_number_that_stands_still_floods_neither_log_nor_queue(monkeypatch: py
     assert acquisition.queue.empty()
 
 
-def test_a_device_that_starts_anew_all_the_time_is_reported_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frequent_device_restarts_are_reported_rarely(monkeypatch: pytest.MonkeyPatch) -> None:
     logged: list[str] = []
     acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     for k in range(1000):
@@ -230,7 +230,7 @@ def test_a_device_that_starts_anew_all_the_time_is_reported_now_and_then(monkeyp
     assert len([line for line in logged if 'started anew' in line]) <= module.NEWS + 1
 
 
-def test_a_clock_that_stands_still_is_reported_and_stamps_follow_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_clock_is_reported_and_host_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     logged: list[str] = []
     acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     late = []

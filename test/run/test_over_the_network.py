@@ -39,7 +39,7 @@ from test.run.test_acquisition import (  # noqa: F401 - they run here once more,
     test_a_silent_device_is_woken,
     test_another_device_on_the_same_port_is_not_taken,
     test_every_lost_sample_has_a_cause,
-    test_garbage_gaps_repeats_and_flags_are_counted_and_cost_nothing_else,
+    test_garbage_gaps_repeats_and_flags_are_counted,
     test_reader_waits_for_an_unplugged_device_and_resumes,
     test_samples_come_as_blocks_with_their_own_times,
     test_stop_hands_over_what_was_read,
@@ -113,7 +113,7 @@ def run(device: ScriptedHost, rig: Rig) -> Iterator[Run]:
     started.acquisition.stop()
 
 
-def test_what_answers_in_another_language_is_asked_for_its_line_speed_at_the_other_end(
+def test_unknown_protocol_suggests_remote_line_speed(
     device: ScriptedHost,
     rig: Rig,
     short_wait: Any,  # noqa: F811
@@ -195,9 +195,7 @@ def frames(sample: Any, *seqs: int) -> bytes:
     return b''.join(encode(sample(s)) for s in seqs)
 
 
-def test_a_lost_a_doubled_and_an_exchanged_datagram_are_counted_and_nothing_is_invented(
-    sender: Sender, over_udp: Run, sample: Any
-) -> None:
+def test_lost_doubled_or_swapped_datagrams_are_counted(sender: Sender, over_udp: Run, sample: Any) -> None:
     sent = [frames(sample, *range(n, n + 5)) for n in range(0, 60, 5)]
     # The third is lost, the fifth comes twice, of the seventh and the eighth the second comes first.
     sender.send(*sent[:2], *sent[3:5], sent[4], sent[5], sent[7], sent[6], *sent[8:])
@@ -211,9 +209,7 @@ def test_a_lost_a_doubled_and_an_exchanged_datagram_are_counted_and_nothing_is_i
     assert sender.pinged.wait(WAIT_S)
 
 
-def test_frames_in_pieces_are_put_together_and_a_lost_piece_is_a_damaged_frame(
-    sender: Sender, over_udp: Run, sample: Any
-) -> None:
+def test_split_frames_are_joined_or_damaged_if_cut(sender: Sender, over_udp: Run, sample: Any) -> None:
     # HELLO between two pieces would end a frame.
     sender.hush()
     stream = frames(sample, *range(20))
@@ -230,7 +226,7 @@ def test_frames_in_pieces_are_put_together_and_a_lost_piece_is_a_damaged_frame(
     assert counters.bad == 1
 
 
-def test_a_device_that_sends_from_another_place_introduces_itself(
+def test_device_at_new_address_introduces_itself(
     sender: Sender, over_udp: Run, sample: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from psd_deflection.devices import udp_port
@@ -300,7 +296,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[str]:
         thread.join()
 
 
-def test_a_run_over_the_network_is_recorded_and_replayed_bit_by_bit(
+def test_network_run_is_recorded_and_replays_exactly(
     served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     logged: list[str] = []

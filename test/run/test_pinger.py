@@ -38,7 +38,7 @@ def test_one_is_due_at_once_and_the_next_at_a_random_time(source: Mock) -> None:
     assert len(set(waits)) > 10
 
 
-def test_an_answer_however_late_reports_when_its_question_was_sent_once(source: Mock) -> None:
+def test_late_answer_returns_send_time_of_question(source: Mock) -> None:
     pinger = Pinger()
     pinger.ask(source, 0.0, 111)
     first = cookie_of(source)
@@ -51,7 +51,7 @@ def test_an_answer_however_late_reports_when_its_question_was_sent_once(source: 
     assert pinger.answered(0) is None
 
 
-def test_a_device_that_leaves_too_many_unanswered_is_asked_no_more(source: Mock) -> None:
+def test_device_with_unanswered_pings_is_asked_no_more(source: Mock) -> None:
     pinger = Pinger()
     for k in range(UNANSWERED):
         assert pinger.is_due(float(k))

@@ -131,7 +131,7 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
 
 
 @pytest.mark.parametrize('noticed', ['while it runs', 'at its end'])
-def test_nothing_is_written_through_a_link_in_place_of_the_folder(tmp_path: Path, noticed: str) -> None:
+def test_nothing_is_written_through_link_at_folder(tmp_path: Path, noticed: str) -> None:
     run = Run(rig_for(tmp_path))
     run.put(1)
     run.folder.rename(tmp_path / 'elsewhere')
@@ -205,9 +205,7 @@ def test_with_nothing_to_delete_it_ends(tmp_path: Path, disk: Disk) -> None:
     assert 'no older file of this recording' in run.heard()
 
 
-def test_a_disk_that_rejects_ends_the_recording_and_says_the_way_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failing_disk_ends_recording_with_advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Run(rig_for(tmp_path))
 
     def reject(fd: int) -> None:

@@ -8,7 +8,7 @@ from psd_deflection.base.log import WARNING, texts
 from psd_deflection.run.rate_limited_log import FIRST_WAIT_S, LONGEST_WAIT_S, MOST_REASONS, RateLimitedLog
 
 
-def test_a_line_a_second_for_a_day_is_few_lines_and_none_is_forgotten() -> None:
+def test_line_per_second_for_a_day_is_few_lines() -> None:
     logged: list[str] = []
     rate_limited_log = RateLimitedLog(texts(logged.append))
     for k in range(86_400):
@@ -37,7 +37,7 @@ def test_what_was_counted_is_reported_when_it_is_due() -> None:
     assert len(logged) == 2
 
 
-def test_the_first_few_are_reported_one_by_one_and_so_is_what_comes_after_a_quiet_time() -> None:
+def test_first_lines_and_those_after_quiet_are_logged() -> None:
     logged: list[str] = []
     rate_limited_log = RateLimitedLog(texts(logged.append))
     for k in range(5):
@@ -48,7 +48,7 @@ def test_the_first_few_are_reported_one_by_one_and_so_is_what_comes_after_a_quie
     assert logged[3:] == ['2 more in the last 99998 s: gone 4', 'gone again']
 
 
-def test_a_new_reason_is_reported_at_once_and_takes_no_count_of_another() -> None:
+def test_new_reason_is_logged_at_once_and_counts_alone() -> None:
     logged: list[str] = []
     rate_limited_log = RateLimitedLog(texts(logged.append))
     for k in range(5):

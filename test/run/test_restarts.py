@@ -75,7 +75,7 @@ def test_a_restart_is_recorded_and_no_command_invents_a_loss(bag: Path, capsys: 
     assert np.diff(open_recording(bag).samples['seq']).max() < 40
 
 
-def test_a_recorded_restart_is_one_when_the_recording_is_the_device(bag: Path) -> None:
+def test_recorded_restart_is_one_on_device_replay(bag: Path) -> None:
     source = make_source(load_rig(overrides={'source': 'replay', 'port': str(bag), 'replay.stamps': 'recorded'}))
     source.open(2.0)
     source.start()

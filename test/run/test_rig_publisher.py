@@ -100,7 +100,7 @@ def running(request: pytest.FixtureRequest) -> Running:
     return Running(load_rig(overrides=request.param), 4000)
 
 
-def test_memory_is_reported_before_the_first_block_soon_and_then_every_ten_seconds(running: Running) -> None:
+def test_memory_is_reported_first_soon_and_every_10_s(running: Running) -> None:
     reported = running.memories()
     assert [text['block'] - 4000 for text in reported] == [0, 50, 550, 1050]
     assert reported[0]['memory'] == {}
@@ -125,7 +125,7 @@ def test_reporting_the_memory_changes_no_record(running: Running) -> None:
 
 
 @pytest.mark.parametrize(('seconds', 'start'), [(2.3, 550), (10.99, 550), (11.5, 1050)])
-def test_a_recorder_that_joins_late_replays_bit_for_bit_from_the_next_memory(
+def test_late_recorder_replays_exactly_from_memory(
     running: Running, seconds: float, start: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In a namespace, in two files."""
@@ -137,7 +137,7 @@ def test_a_recorder_that_joins_late_replays_bit_for_bit_from_the_next_memory(
     assert 'no bit differs' in output
 
 
-def test_a_recorder_that_was_there_from_the_start_replays_from_the_start(
+def test_early_recorder_replays_exactly_from_start(
     running: Running, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = written(tmp_path / 'early', running.heard)

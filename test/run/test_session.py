@@ -135,9 +135,7 @@ def test_a_step_of_the_system_clock_moves_no_stamp_of_the_run(
     assert acquisition.system_clock_step_ns() == pytest.approx(-3600e9, abs=1e9)
 
 
-def test_no_zero_is_taken_of_a_device_that_has_reported_nothing_for_long(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_zero_of_long_silent_device_is_rejected(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'SILENT_S', -1e3)
     with pytest.raises(TimeoutError, match='no data flows'):
         running.session.zero()
@@ -153,9 +151,7 @@ class Observed:
         self.records.append(record)
 
 
-def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
-    running: Running, device: ScriptedDevice, sample: Sample
-) -> None:
+def test_annotated_load_holds_for_the_next_recording(running: Running, device: ScriptedDevice, sample: Sample) -> None:
     session, observed = running.session, Observed()
     session.input_sinks.append(observed)
     first = session.note_load(0.0, -10.0, 0.5)
@@ -174,9 +170,7 @@ def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     assert [r for r in observed.records if isinstance(r, AppliedLoad)] == [first, *loads]
 
 
-def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_reported_now(
-    running: Running, device: ScriptedDevice, sample: Sample
-) -> None:
+def test_past_load_is_stamped_with_its_own_time(running: Running, device: ScriptedDevice, sample: Sample) -> None:
     session = running.session
     folder = session.record(True).result(WAIT_S)
     assert folder is not None
@@ -260,9 +254,7 @@ def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDe
     assert open_recording(folder).marks() == [first, last] == observed.records
 
 
-def test_a_mark_that_is_none_or_comes_too_often_is_rejected_and_counted(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_or_frequent_mark_is_rejected(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     session, observed = running.session, Observed()
     session.input_sinks.append(observed)
     for text in ('', 'x' * 201, 'a\x1b[31m', '\ud800'):
@@ -305,9 +297,7 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     assert entry.message.startswith(f'{REFERENCE}: rejected: ')
 
 
-def test_what_was_counted_of_rejected_messages_is_reported_though_no_more_come(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rejected_count_is_reported_after_last_message(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     """The health is asked once a second, whatever the run publishes."""
     settled: queue.SimpleQueue[float] = queue.SimpleQueue()
     monkeypatch.setattr(RateLimitedLog, 'settle', lambda _, now_s: settled.put(now_s))

@@ -59,7 +59,7 @@ class Hanging:
         ('recorder', 'it is not waited for, and 0 messages are not written.'),
     ],
 )
-def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
+def test_part_that_hangs_delays_end_by_two_seconds(
     device: Any, rig: Rig, tmp_path: Path, part: str, reported: str
 ) -> None:
     logged: list[str] = []
@@ -107,7 +107,7 @@ def ended_with(session: Session) -> list[BaseException]:
     return [] if session.failed is None else [session.failed]
 
 
-def test_samples_that_found_no_room_are_reported_and_counted_everywhere(
+def test_samples_without_room_are_reported_and_counted(
     device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], capsys: pytest.CaptureFixture[str]
 ) -> None:
     logged: list[str] = []
@@ -188,7 +188,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
 
 
 @pytest.mark.slow
-def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_named(
+def test_samples_behind_part_that_hangs_are_counted(
     device: Any,
     rig: Rig,
     tmp_path: Path,

@@ -74,7 +74,7 @@ def test_each_logged_correction_is_in_the_table() -> None:
     assert [line for line in result if not any(part in line for part in (*stated, *OTHER))] == []
 
 
-def test_each_statement_is_one_of_the_package_and_says_how_it_is_known() -> None:
+def test_statements_are_package_texts_with_known_basis() -> None:
     named = [part for row in rows('Statements', 0) for part in row]
     assert [part for part in named if part.split('JOINT')[0].split('CAUSE')[0].split('ACTION')[0] not in texts()] == []
     section = PAGE.split('## Statements\n')[1]

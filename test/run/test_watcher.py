@@ -180,7 +180,7 @@ def a_load(t_ns: int) -> tuple[str, str, bytes, int]:
     return LOAD, message.type, cdr.encode(message.type, message.fields), t_ns
 
 
-def test_ten_thousand_inputs_a_second_with_the_device_away_do_not_fill_the_memory(tmp_path: Path) -> None:
+def test_input_flood_without_device_is_bounded(tmp_path: Path) -> None:
     chain = Chain(tmp_path, watch_memory=1_000_000)
     chain.feed(1.0)
     topic, kind, message, _ = a_load(START_NS)
@@ -208,7 +208,7 @@ def test_nothing_is_held_of_a_device_that_has_been_away_for_long(tmp_path: Path)
     assert not chain.logged
 
 
-def test_after_full_memory_what_is_kept_replays_as_the_run_computed_it(tmp_path: Path) -> None:
+def test_run_kept_of_full_memory_replays_as_computed(tmp_path: Path) -> None:
     chain = Chain(tmp_path, watch_memory=1_000_000)
     chain.feed(1.0)
     chain.load(0.0, 0.0, 0.0)

@@ -112,7 +112,7 @@ def test_unwritable_zero_file_is_reported(tmp_path: Path) -> None:
     assert json.loads((tmp_path / 'zero.json').read_text())['serial'] == 'A'
 
 
-def test_a_zero_that_cannot_be_kept_in_the_background_is_reported(tmp_path: Path) -> None:
+def test_zero_that_cannot_be_stored_is_reported(tmp_path: Path) -> None:
     (tmp_path / 'file').write_text('')
     rig = load_rig(overrides={'zero_file': str(tmp_path / 'file' / 'zero.json')})
     store = ZeroStore(rig, 'A')

@@ -55,7 +55,7 @@ def test_two_lenses_leave_two_parallel_beams_apart() -> None:
 
 
 @pytest.mark.slow
-def test_one_that_fails_costs_certainty_and_a_cold_spare_its_warm_up() -> None:
+def test_failed_laser_costs_certainty_or_warm_up() -> None:
     both, out, alone, cold, spare = simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.5))
     assert [p.estimates for p in (both, out, alone, cold, spare)] == [1.0, 1.0, 1.0, 0.0, 1.0]
     assert cold.status is BlockStatus.LASER_LOST

@@ -130,7 +130,7 @@ def test_three_links_in_any_direction_bend_as_a_frame_of_beams(seed: int) -> Non
     assert chain.tips_under(force) == pytest.approx(np.array(frame.tips), rel=1e-4, abs=1e-9)
 
 
-def test_the_slope_ratio_of_a_force_is_wrong_for_a_link_that_carries_another_one() -> None:
+def test_slope_ratio_of_force_is_wrong_for_inner_link() -> None:
     """What docs/chains.md says of ``ratio``; the moment of the next link's load bends too."""
     rng = np.random.default_rng(0)
     chain = random_chain(rng, 3, 'ratio')
@@ -140,7 +140,7 @@ def test_the_slope_ratio_of_a_force_is_wrong_for_a_link_that_carries_another_one
     assert 0.03 < error < 0.3
 
 
-def test_a_chain_that_says_nothing_takes_the_load_to_hang_at_its_end() -> None:
+def test_chain_without_load_entry_assumes_end_force() -> None:
     rng = np.random.default_rng(3)
     asked = random_chain(rng, 3, 'end_force')
     chain = Chain(asked.links, asked.end)
@@ -152,7 +152,7 @@ def test_a_chain_that_says_nothing_takes_the_load_to_hang_at_its_end() -> None:
 @pytest.mark.parametrize(
     ('slopes', 'share'), [('end_force', 0.0), ('end_force', 0.3), ('end_force', 1.0), ('ratio', 0.0)]
 )
-def test_the_covariance_holds_what_the_assumption_about_the_load_leaves(slopes: str, share: float) -> None:
+def test_covariance_covers_other_forces_than_assumed(slopes: str, share: float) -> None:
     """Readings without noise, and other forces at the tips, ``share`` of that at the end."""
     inside, error, stated = [], [], []
     for seed in range(12):

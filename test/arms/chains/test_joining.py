@@ -51,7 +51,7 @@ def test_blocks_that_coincide_are_taken_as_they_are() -> None:
     assert np.array_equal(got[3].tips[1].covariance, np.reshape(NOISE, (3, 3)))
 
 
-def test_what_a_line_leaves_out_of_a_motion_widens_the_covariance() -> None:
+def test_interpolated_motion_widens_covariance() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
     out: list[Joined] = []
     for n in range(200):
@@ -65,7 +65,7 @@ def test_what_a_line_leaves_out_of_a_motion_widens_the_covariance() -> None:
     assert np.mean(errors**2) / np.mean(stated) == pytest.approx(1.0, abs=0.5)
 
 
-def test_a_lost_block_of_another_link_is_missing_at_the_times_beside_it() -> None:
+def test_lost_block_of_other_link_leaves_gap_beside_it() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
     kept = [t for t in every(7_000_000, 10) if t != 7_000_000 + 4 * BLOCK_NS]
     got = run(joiner, {0: every(0, 10), 1: kept})
@@ -75,7 +75,7 @@ def test_a_lost_block_of_another_link_is_missing_at_the_times_beside_it() -> Non
     assert joiner.joined == 7
 
 
-def test_a_link_that_ends_is_given_up_after_some_blocks_and_comes_back() -> None:
+def test_ended_link_is_dropped_and_joins_on_return() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
     got = run(joiner, {0: every(0, 40), 1: every(7_000_000, 5)})
     assert [j.t_ns // BLOCK_NS for j in got if j.missing] == list(range(5, 39 - PATIENCE))
@@ -84,7 +84,7 @@ def test_a_link_that_ends_is_given_up_after_some_blocks_and_comes_back() -> None
     assert joiner.missing[1] == 36
 
 
-def test_lost_blocks_of_the_first_link_are_counted_when_it_comes_back() -> None:
+def test_lost_blocks_of_first_link_are_counted_later() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
     run(joiner, {0: every(0, 5) + every(8 * BLOCK_NS, 5), 1: every(7_000_000, 13)})
     assert joiner.missing == [3, 0]

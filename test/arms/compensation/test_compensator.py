@@ -201,9 +201,7 @@ NAN = shift(math.nan, 0.0, 0.0)
         ({'deflection': shift(0.1, 0.0, 0.0)}, 'jumps by'),
     ],
 )
-def test_a_bad_deflection_is_not_followed_and_good_ones_are_again(
-    arm: Arm, changed: dict[str, object], why: str
-) -> None:
+def test_offsets_hold_from_bad_to_good_deflections(arm: Arm, changed: dict[str, object], why: str) -> None:
     loop = following(arm)
     before = loop.offsets
     loop.t += PERIOD
@@ -218,7 +216,7 @@ def test_a_bad_deflection_is_not_followed_and_good_ones_are_again(
     assert loop.run(PERIOD * 10).state is State.FOLLOWING
 
 
-def test_a_deflection_is_followed_up_to_the_deviation_that_is_allowed(arm: Arm) -> None:
+def test_deflection_is_followed_up_to_max_sd(arm: Arm) -> None:
     # A power of two has an exact square.
     bound = 2.0**-10
     loop = following(arm, max_sd=bound)
@@ -343,7 +341,7 @@ def test_two_nodes_that_report_different_joints_hold_the_offsets(arm: Arm) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize('step', [3600.0, -3600.0])
-def test_a_clock_that_is_set_holds_the_offsets_for_some_estimates_only(arm: Arm, step: float) -> None:
+def test_clock_step_holds_offsets_for_some_estimates(arm: Arm, step: float) -> None:
     """That of the estimator and ours: the stamps change, and their ages do not."""
     loop = following(arm)
     before = loop.offsets
@@ -432,7 +430,7 @@ def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('how', [{}, {'takeover': True}, {'output': 'commands'}], ids=repr)
-def test_an_arm_that_reports_seldom_is_not_taken_for_one_that_does_not_follow(arm: Arm, how: dict[str, Any]) -> None:
+def test_seldom_reporting_arm_is_still_following(arm: Arm, how: dict[str, Any]) -> None:
     loop = following(arm, stale=0.5, jump=1.0, **how)
     before = loop.offsets
     loop.plant.force = 4.0 * PAYLOAD
@@ -464,7 +462,7 @@ def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
     assert loop.error() == pytest.approx(command.residual, abs=1e-4)
 
 
-def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> None:
+def test_controller_with_other_offsets_is_sent_no_more(arm: Arm) -> None:
     loop = reporting(arm)
     before = loop.offsets
     for n in range(1, 30):
@@ -485,7 +483,7 @@ def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> 
 
 
 @pytest.mark.slow
-def test_a_controller_that_starts_again_without_offsets_is_sent_no_step(arm: Arm) -> None:
+def test_controller_restarted_at_zero_gets_no_step(arm: Arm) -> None:
     """It ends, so nothing is sent. It comes back with none, and is led from there to those that are needed."""
     loop = reporting(arm)
     needed = loop.offsets
@@ -509,7 +507,7 @@ def test_a_stop_that_is_over_is_no_reason_any_more(arm: Arm) -> None:
     assert loop.send(loop.t + 1.0).why == 'no deflection for 0.08 s'
 
 
-def test_switched_off_while_nothing_is_reported_the_offsets_go_back_once_it_is(arm: Arm) -> None:
+def test_switch_off_in_silence_returns_offsets_later(arm: Arm) -> None:
     loop = reporting(arm)
     loop.reports = False
     loop.run(0.1)
@@ -534,7 +532,7 @@ def test_switched_off_while_nothing_is_reported_the_offsets_go_back_once_it_is(a
     assert len(loop.sent) == count
 
 
-def test_switched_off_while_the_robot_stands_offsets_that_were_silent_go_back(arm: Arm) -> None:
+def test_switch_off_while_robot_stands_returns_offsets(arm: Arm) -> None:
     loop = reporting(arm)
     loop.compensator.stop('the robot does not run')
     loop.reports = False
@@ -547,7 +545,7 @@ def test_switched_off_while_the_robot_stands_offsets_that_were_silent_go_back(ar
     assert loop.step() <= 1.0 + 1e-9
 
 
-def test_offsets_of_the_controller_that_cannot_be_ours_are_not_taken_over(arm: Arm) -> None:
+def test_controller_offsets_above_max_are_not_adopted(arm: Arm) -> None:
     loop = Loop(arm, takeover=True)
     loop.offsets = np.array([0.0, 3.0])
     loop.compensator.enable(True)
@@ -655,7 +653,7 @@ def test_with_commands_the_arm_keeps_the_pose_that_it_had(arm: Arm) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('droop', [0.0, 0.005])
-def test_with_commands_it_begins_at_the_command_of_the_controller(arm: Arm, droop: float) -> None:
+def test_commands_start_at_controller_command(arm: Arm, droop: float) -> None:
     """However far the servos leave the joints below it, and however often it is enabled."""
     loop = Loop(arm, output='commands')
     loop.droop = droop
@@ -708,7 +706,7 @@ def test_with_commands_an_unknown_or_far_command_is_rejected(arm: Arm, reports: 
     assert why in command.why
 
 
-def test_offsets_of_before_are_reported_and_taken_back_on_request(arm: Arm) -> None:
+def test_earlier_offsets_are_removed_on_request_only(arm: Arm) -> None:
     loop = following(arm)
     held = loop.offsets.copy()
     loop.compensator, loop.reports, count = Compensator(arm, CompensatorSettings(axes=('x', 'z'))), True, len(loop.sent)
@@ -724,7 +722,7 @@ def test_offsets_of_before_are_reported_and_taken_back_on_request(arm: Arm) -> N
     assert loop.step() <= 1.0 + 1e-9
 
 
-def test_with_commands_an_arm_that_stops_holds_and_one_that_was_moved_is_left_alone(arm: Arm) -> None:
+def test_commands_hold_for_stopped_or_moved_arm(arm: Arm) -> None:
     """Commands of before would move it back at once when its controller runs again."""
     loop = Loop(arm, output='commands')
     loop.plant.force = PAYLOAD

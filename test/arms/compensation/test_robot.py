@@ -13,7 +13,7 @@ def test_a_robot_of_which_nothing_is_reported_runs() -> None:
     assert RobotWatch().fault(1e9) == ''
 
 
-def test_a_driver_that_says_so_once_is_believed_until_it_says_otherwise() -> None:
+def test_driver_run_state_persists_until_next_report() -> None:
     robot = RobotWatch()
     robot.runs(False)
     assert robot.fault(1e6) == 'the robot does not run'

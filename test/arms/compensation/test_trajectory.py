@@ -102,7 +102,7 @@ def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
     assert np.array_equal(second.states[-1, 0], [0.0, 0.0])
 
 
-def test_what_was_replaced_before_the_last_one_still_has_its_points() -> None:
+def test_points_of_twice_replaced_trajectory_are_kept() -> None:
     """Lines with a kink: without a point there the controller would cut the corner."""
     by = shaper('zvd', 3.0, 0.02)
     starts = [0.0, 0.2, 0.3]
@@ -263,7 +263,7 @@ def test_shapers_in_series_end_both_modes() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
-def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
+def test_shaped_arm_move_leaves_five_percent_vibration(kind: str, wrong: float) -> None:
     assert shapers.residual(shaper(kind, wrong * shapers.FREQUENCY, shapers.RATIO)) < 0.05
 
 
@@ -325,7 +325,7 @@ def test_however_long_messages_take_a_replacement_makes_no_step(orders: int) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('orders', [1, 2])
-def test_a_message_that_comes_after_the_lead_is_a_step_and_the_only_one(orders: int) -> None:
+def test_message_after_lead_is_the_only_step(orders: int) -> None:
     """The shaper cannot know when a message arrives: one that has begun by then is joined in its middle."""
     latencies = np.full(40, 0.004)
     latencies[::5] = 0.15
@@ -335,7 +335,7 @@ def test_a_message_that_comes_after_the_lead_is_a_step_and_the_only_one(orders: 
     assert replaced(orders, 0.2, latencies) <= 1.0 + 1e-6
 
 
-def test_a_first_point_that_is_a_little_off_is_no_step_of_one_under_way() -> None:
+def test_first_point_slightly_off_path_makes_no_step() -> None:
     by = TrajectoryShaper(ZV)
     by.shape(0, moved(2), ZERO)
     there = moved(2).at(np.array([0.2]))[0]

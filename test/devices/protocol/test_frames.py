@@ -103,7 +103,7 @@ def test_a_frame_and_its_bytes(label: str, encoded: str, frame: GoodFrame) -> No
         assert encode(frame, wide=label == WIDE) == received
 
 
-def test_a_sample_goes_with_16_bits_a_count_unless_asked_otherwise() -> None:
+def test_sample_counts_default_to_16_bits() -> None:
     assert encode(SAMPLE) == encode(SAMPLE, wide=False)
     assert len(encode(SAMPLE, wide=True)) == len(encode(SAMPLE)) + 2 * len(SAMPLE.counts)
 
@@ -123,7 +123,7 @@ def test_a_device_time_of_285_years_is_the_latest(wide: bool) -> None:
     assert bad.reason == BadReason.BODY
 
 
-def test_a_frame_that_is_too_long_is_as_long_as_it_was_however_it_was_cut() -> None:
+def test_overlong_frame_has_same_length_for_any_cut() -> None:
     for cuts in ((600,), (512, 600), (513, 600), (100, 513, 514, 600)):
         decoder = FrameDecoder()
         decoder.feed(b'\x00')
@@ -132,7 +132,7 @@ def test_a_frame_that_is_too_long_is_as_long_as_it_was_however_it_was_cut() -> N
         assert decoder.feed(b'\x00' + SAMPLE_BYTES) == [BadFrame(BadReason.TOO_LONG, 600), SAMPLE]
 
 
-def test_the_tail_of_a_frame_that_began_before_we_listened_is_passed_over() -> None:
+def test_tail_of_partial_first_frame_is_skipped() -> None:
     for cut in range(1, len(SAMPLE_BYTES)):
         assert FrameDecoder().feed(SAMPLE_BYTES[cut:] + SAMPLE_BYTES) == [SAMPLE]
 
@@ -241,9 +241,7 @@ def samples_of_some(draw: st.DrawFn) -> tuple[SampleFrame, bool]:
 
 @pytest.mark.slow
 @given(samples_of_some(), st.integers(2, MOST_PSDS))
-def test_a_sample_of_any_number_of_psds_comes_back_and_no_other_is_taken(
-    sample: tuple[SampleFrame, bool], psds: int
-) -> None:
+def test_sample_decodes_for_its_number_of_psds_only(sample: tuple[SampleFrame, bool], psds: int) -> None:
     frame, wide = sample
     stream = b'\x00' + encode(frame, wide=wide)
     assert len(stream) - 2 <= MAX_ENCODED
@@ -262,7 +260,7 @@ def test_counts_that_are_not_three_of_each_psd_cannot_be_sent(count: int) -> Non
 
 
 @given(st.binary(max_size=200), st.integers(2, MOST_PSDS))
-def test_whatever_comes_a_sample_has_the_number_of_psds_that_was_asked_for(junk: bytes, psds: int) -> None:
+def test_decoded_sample_has_expected_number_of_psds(junk: bytes, psds: int) -> None:
     body = bytes((1,)) + junk
     sealed = cobs.encode(body + zlib.crc32(body).to_bytes(4, 'little'))
     for frame in FrameDecoder(psds).feed(b'\x00' + sealed + b'\x00' + junk + b'\x00'):

@@ -56,7 +56,7 @@ def noise_of_poses(a: int, b: int) -> FloatArray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('count', [1, 2])
-def test_what_axes_share_is_the_noise_of_the_readings_through_the_gains(count: int) -> None:
+def test_axis_covariance_is_noise_through_gains(count: int) -> None:
     pose, velocity = np.zeros((2, count, 3, N))
     for block in range(count):
         for axis in range(3):
@@ -75,7 +75,7 @@ def test_what_axes_share_is_the_noise_of_the_readings_through_the_gains(count: i
         assert state.velocity_covariance[b, a] == state.velocity_covariance[a, b]
 
 
-def test_what_begins_after_the_last_sample_of_a_block_moves_nothing_before() -> None:
+def test_acceleration_after_block_moves_nothing_before() -> None:
     one = linear()
     one.block(0, 0, SLOTS, np.zeros((N, 3)))
     still = one.predicted(np.array([0.005]))

@@ -82,7 +82,7 @@ def test_it_is_the_solution_of_the_equation_of_motion() -> None:
     assert (known.count, known.late) == (4, 1)
 
 
-def test_it_holds_for_a_tenth_of_a_second_and_the_first_one_is_doubted() -> None:
+def test_acceleration_holds_0_1_s_and_starts_uncertain() -> None:
     known = Inertia(MODES, L)
     first = BaseAcceleration(10 * MS, (1.0, 0.0, 0.0), NONE)
     known.notify(first, 0)

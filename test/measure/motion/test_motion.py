@@ -74,7 +74,7 @@ def test_the_covariance_of_the_pose_is_that_of_its_errors() -> None:
 
 
 @pytest.mark.slow
-def test_without_samples_for_100_ms_the_truth_is_within_three_deviations(operation: motion.Run) -> None:
+def test_truth_after_100_ms_gap_is_within_three_sd(operation: motion.Run) -> None:
     beyond = []
     pipeline = Pipeline(RIG)
     filtered = pipeline.motion_filter

@@ -38,7 +38,7 @@ def unknowns_of(tilts: Tilts) -> int:
 
 @pytest.mark.parametrize('tilts', ['none', 'tied', 'bounded', 'free'])
 @pytest.mark.parametrize('kept', [[0, 1, 2], [0, 2]])
-def test_a_plate_model_leaves_what_it_does_not_explain_and_nothing_else(tilts: Tilts, kept: list[int]) -> None:
+def test_plate_model_residual_is_the_unexplained_part(tilts: Tilts, kept: list[int]) -> None:
     if tilts == 'free' and len(kept) == 2:
         return
     rig = rig_of(3)
@@ -62,7 +62,7 @@ def test_a_plate_model_leaves_what_it_does_not_explain_and_nothing_else(tilts: T
     np.testing.assert_allclose(model.residuals(at_rest + errors), want, atol=1e-12)
 
 
-def test_steps_from_rest_end_below_a_tenth_of_a_nanometre_at_the_largest_poses() -> None:
+def test_steps_from_rest_converge_at_largest_poses() -> None:
     """3 mm, 3 degrees and tilts of half a degree: after six steps more than a nanometre is left."""
     rig = rig_of(3)
     poses = np.array([[3e-3, -3e-3, 0.05, 0.01, 0.01]])

@@ -53,7 +53,7 @@ def test_the_polynomials_are_orthonormal_and_start_with_the_mean(size: int) -> N
     assert q.shape[1] == orders[size]
 
 
-def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_are() -> None:
+def test_last_combination_is_base_line_length() -> None:
     """Over the root of 2, without that of the beams; and the way back is the way there."""
     rng = np.random.default_rng(4)
     for _ in range(5):
@@ -68,7 +68,7 @@ def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_
 
 
 @pytest.mark.parametrize('slots', GAPS, ids=lambda s: f'{len(s)} samples')
-def test_a_ringing_plate_is_followed_where_samples_are_missing_too(slots: IntArray) -> None:
+def test_ringing_plate_with_lost_samples_is_followed(slots: IntArray) -> None:
     """14 and 21 Hz of some tenths of a millimetre, without noise: the mean is tens of micrometres off."""
     fit = fitter()
     t = (ALL - 9.5) * 1e-3
@@ -247,9 +247,7 @@ def shaken(fit: BlockFit, hz: float, amplitude: float, blocks: int, seed: int = 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('hz', 'amplitude'), [(5.0, 15e-6), (20.0, 15e-6), (30.0, 10e-6)])
-def test_a_steady_motion_that_bends_a_block_by_as_much_as_its_noise_is_in_the_variance(
-    hz: float, amplitude: float
-) -> None:
+def test_variance_covers_motion_curved_by_noise_level(hz: float, amplitude: float) -> None:
     z, _ = shaken(fitter(), hz, amplitude, 4000)
     assert 0.94 < np.mean(np.abs(z[500:]) < 1.959964) < 0.97
 
@@ -304,7 +302,7 @@ def test_small_blocks_follow_motion_and_say_how_well(size: int) -> None:
     assert np.mean(z < 3.0) > 0.99
 
 
-def test_blocks_that_always_lose_their_end_say_how_little_they_report() -> None:
+def test_blocks_losing_their_end_cover_their_error() -> None:
     """Weights of some 1e-5 a block are weights: 0.93 were within three deviations, and the rms error was 6 um."""
     assert np.mean(np.abs(swaying(20, tuple(range(12, 20)))) < 3.0) > 0.99
 

@@ -48,7 +48,7 @@ def test_a_flat_plate_is_meant_unless_slopes_are_given() -> None:
     np.testing.assert_allclose(of.turn[3:] @ slopes, 0.0, atol=1e-15)
 
 
-def test_slopes_that_all_but_agree_with_a_reading_leave_no_rounding() -> None:
+def test_near_dependent_slopes_leave_no_rounding() -> None:
     """Unit vectors that the first rows span to 1e-7 are left out; those that are 1e-5 apart are taken."""
     for off, spanned in ((1e-7, True), (1e-5, False)):
         slopes = np.zeros((6, 3))
@@ -86,7 +86,7 @@ def test_the_covariance_of_two_psds_goes_back_as_the_dots_do() -> None:
     np.testing.assert_allclose(back_covariance, slopes @ covariance @ slopes.T, rtol=1e-6, atol=1e-8)
 
 
-def test_a_base_line_shorter_than_its_twist_has_a_hundredth_left_along() -> None:
+def test_base_line_below_its_twist_keeps_a_hundredth() -> None:
     """What no plate can show: still a number."""
     apart = CENTERS[0] - CENTERS[1]
     beams = CENTERS[:2] + ZEROS[:2]

@@ -60,7 +60,7 @@ def test_excess_of_the_base_line_is_that_of_least_squares(seed: int) -> None:
         assert residual_of(true, DESIGN, COVARIANCE)[1] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_readings_with_next_to_no_part_in_the_base_line_have_no_error() -> None:
+def test_readings_across_base_line_have_no_error() -> None:
     """Along a base line in x a wrong y changes its length to second order only."""
     for y, observed in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
         got = two().update(BaseLineExcess((0.14, y), (1e-5, 0.0, -1e-5, 0.0), COVARIANCE), 1.0, None)
@@ -104,7 +104,7 @@ def test_limits_of_one_degree_are_those_of_the_shares() -> None:
     np.testing.assert_allclose(ONE_DEGREE, chi2.isf([CONTRADICTS, DOUBTFUL], 1), rtol=2e-5)
 
 
-def test_a_covariance_is_widened_by_what_each_error_alone_would_cause() -> None:
+def test_covariance_is_widened_by_each_error_alone() -> None:
     gain = np.linalg.pinv(DESIGN)
     errors = (1e-5, -2e-5, 0.0, 3e-5)
     own = gain @ COVARIANCE @ gain.T
@@ -154,7 +154,7 @@ def check(
 
 
 @pytest.mark.parametrize('psd', range(1, PSDS + 1))
-def test_the_error_of_one_psd_alone_is_that_of_least_squares_with_two_unknowns_more(psd: int) -> None:
+def test_psd_error_is_least_squares_with_two_unknowns(psd: int) -> None:
     readings = with_error(psd, (2e-4, -3e-4)) + 1e-6 * np.random.default_rng(psd).normal(size=2 * PSDS)
     got = check(four(), readings)
     assert got.chi_square == pytest.approx(residual_of(readings, SLOPES, FULL)[1], rel=1e-9)
@@ -166,7 +166,7 @@ def test_the_error_of_one_psd_alone_is_that_of_least_squares_with_two_unknowns_m
 
 
 @pytest.mark.parametrize('unknowns', [6, 7])
-def test_with_one_or_two_degrees_of_freedom_each_reading_has_its_own_error(unknowns: int) -> None:
+def test_each_reading_has_own_error_at_low_freedom(unknowns: int) -> None:
     slopes = np.random.default_rng(unknowns).normal(size=(2 * PSDS, unknowns))
     readings = 1e-5 * np.random.default_rng(9).normal(size=2 * PSDS)
     checks = ConsistencyCheck(PSDS, unknowns, 2 * PSDS)
@@ -217,7 +217,7 @@ def test_the_only_psd_to_blame_is_left_out_for_a_second(psd: int) -> None:
     assert check(checks, with_error(psd, (0.0, 0.0)), set()).excluded == 0
 
 
-def test_if_two_may_be_blamed_none_is_left_out_and_both_errors_are_allowed_for() -> None:
+def test_two_outlier_candidates_stay_with_both_errors() -> None:
     checks = four()
     got = check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {1, 3})
     assert (got.excluded, got.contradict) == (0, True)

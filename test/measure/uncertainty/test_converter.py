@@ -82,7 +82,7 @@ def test_steps_that_are_no_coarser_than_the_files_are_none(step: float, noise: f
         assert not fed(volts(step, noise, seed, 100), file).steps.any()
 
 
-def test_a_step_is_not_believed_before_thirty_samples_and_one_finer_value_ends_it() -> None:
+def test_converter_step_needs_30_samples_and_ends_on_finer() -> None:
     steps = ConverterSteps(1, FILE, COARSEST)
     level = np.zeros((20, 1))
     toggled = level.copy()

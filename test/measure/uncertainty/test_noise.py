@@ -78,7 +78,7 @@ def rested(noise: StreamNoise) -> bool:
     return noise.at_rest
 
 
-def test_a_rig_that_never_rests_takes_the_colour_from_the_base_line() -> None:
+def test_restless_rig_takes_noise_colour_of_base_line() -> None:
     noise = stream()
     feed(noise, coloured(10 * SEGMENT, 0.6, 8) + ringing(10 * SEGMENT))
     assert not rested(noise)
@@ -101,7 +101,7 @@ def test_one_spike_is_not_noise() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('sigma', 'seeds'), [(0.0, 1), (0.3, 1), (0.6, 1)])
-def test_the_error_of_a_mean_of_coarse_readings_is_inside_what_is_reported(sigma: float, seeds: int) -> None:
+def test_mean_of_coarse_readings_is_within_reported_error(sigma: float, seeds: int) -> None:
     """Steps of 10 um: over all places between two steps, the rms error of the mean is what is stated, or less."""
     step = 10e-6
     rng = np.random.default_rng(16)
@@ -229,7 +229,7 @@ def test_segments_follow_the_rules() -> None:
 
 
 @pytest.mark.parametrize('sigma', [0.0, 0.2, 0.35])
-def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) -> None:
+def test_undithered_rounding_stays_as_error(sigma: float) -> None:
     """Mean square over all places of the mean of the rounded reading less the place, added up by hand."""
     step = 3.0
     place = (np.arange(2000) + 0.5) / 2000.0

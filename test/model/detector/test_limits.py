@@ -81,14 +81,14 @@ def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, s
     assert classify(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
 
 
-def test_the_devices_flag_blames_no_detector_unless_a_cause_is_observed() -> None:
+def test_device_flag_blames_no_detector_without_cause() -> None:
     reported = classify(flag=FLAG_OVER_RANGE)
     assert (reported.status, reported.faulty) == (BlockStatus.SATURATED, 0)
     assert classify(changed(2, 0.0), flag=FLAG_OVER_RANGE).status is BlockStatus.LASER_LOST
 
 
 @pytest.mark.parametrize(('blocks', 'status'), [(4, BlockStatus.OK), (5, BlockStatus.FROZEN)])
-def test_a_detector_is_frozen_after_five_blocks_if_that_is_to_be_rejected(blocks: int, status: BlockStatus) -> None:
+def test_frozen_detector_is_rejected_after_five_blocks(blocks: int, status: BlockStatus) -> None:
     for psd, frozen in ((1, (blocks, 0)), (2, (0, blocks))):
         got = classify_frozen(frozen)
         assert got.status is status
@@ -127,7 +127,7 @@ def test_too_few_samples_leave_no_detector_to_go_on_with() -> None:
     assert (dark.status, dark.faulty, dark.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1}))
 
 
-def test_the_worst_cause_is_reported_first_and_two_faults_leave_nothing() -> None:
+def test_worst_cause_is_first_and_both_psds_are_faulty() -> None:
     far = (1.0, 0.0, 1.25e-4, -1.25e-4)
     both = classify(changed(5, 0.0), far)
     assert (both.status, both.faulty, both.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1, 2}))
@@ -148,7 +148,7 @@ def test_half_the_light_on_both_is_one_laser_of_two(share: float, reported: bool
     assert not classify(volts).half_light
 
 
-def test_other_light_and_a_clipped_spot_are_reported_of_the_detector() -> None:
+def test_other_light_or_clipped_spot_names_detector() -> None:
     most = load_rig().estimator.sum_max
     for psd, channel in ((1, 2), (2, 5)):
         assert classify(one=changed(channel, most + 0.01)).findings == (
@@ -164,7 +164,7 @@ def test_other_light_and_a_clipped_spot_are_reported_of_the_detector() -> None:
             assert classify(dots=dots).findings == message
 
 
-def test_the_sound_detectors_are_those_without_a_fault_if_samples_are_enough() -> None:
+def test_faultless_detectors_are_sound_with_enough_samples() -> None:
     assert classify(changed(2, 0.0)).sound == (1,)
     assert classify(changed(5, 0.0)).sound == (0,)
     assert classify((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).sound == ()
@@ -188,7 +188,7 @@ def test_a_detector_is_still_if_x_y_and_sum_are(channel: int) -> None:
 
 @pytest.mark.parametrize('channel', range(6))
 @pytest.mark.parametrize('size', [10, 20])
-def test_noise_is_separated_from_five_times_what_amplifier_and_converter_have(channel: int, size: int) -> None:
+def test_noise_is_separated_at_five_times_rig_noise(channel: int, size: int) -> None:
     """The third difference of a, -a, a ... is 8 a, that of white noise of s has the rms s sqrt(20)."""
     sigma = 1e-4
     rig = load_rig(overrides={'amplifier.noise': sigma, 'block_size': size, 'min_samples': size // 2})
@@ -202,7 +202,7 @@ def test_noise_is_separated_from_five_times_what_amplifier_and_converter_have(ch
         assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * reported
 
 
-def test_blocks_of_nine_samples_and_blocks_with_gaps_report_no_noise() -> None:
+def test_nine_sample_blocks_and_gaps_report_no_noise() -> None:
     volts = np.tile((-1.0) ** np.arange(20, dtype=np.float32)[:, None], (1, 6)).astype(np.float32)
     for size, present in ((9, 9), (20, 19)):
         rig = load_rig(overrides={'block_size': size, 'min_samples': 4})

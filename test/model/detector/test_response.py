@@ -92,7 +92,7 @@ def test_the_budget_reads_what_the_simulation_does(
 
 @pytest.mark.slow
 @given(place, place, st.floats(-0.1, 0.1), share, share, share, share, st.floats(-3000.0, 3000.0))
-def test_the_calibration_reads_what_the_simulation_does_and_finds_the_place_again(
+def test_calibration_response_inverts_simulation(
     x: float, y: float, angle: float, gain_x: float, gain_y: float, xy: float, yx: float, k: float
 ) -> None:
     response = DetectorResponse(angle, gain_x, gain_y, xy, yx, k)

@@ -38,7 +38,7 @@ def test_counts_become_volts_rounded_once() -> None:
     assert got[0].tolist() == [np.float32(c * (10.0 / 32768.0)) for c in counts[0].tolist()]
 
 
-def test_each_channel_has_its_own_noise_and_sensitivity_and_zero_means_the_amplifiers() -> None:
+def test_channels_have_own_noise_and_sensitivity() -> None:
     rig = rig_from_values({'psd_1.noise': [1e-3, 0.0], 'psd_2.noise': [4e-3, 3e-3], 'psd_2.sensitivity': [0.0, 1e-3]})
     step = 20.0 / 65536.0
     expected = [s**2 * (n**2 + step**2 / 12.0) for s, n in ((5e-4, 1e-3), (5e-4, 2e-3), (5e-4, 4e-3), (1e-3, 3e-3))]
@@ -94,7 +94,7 @@ def test_a_quadrant_sees_the_light_of_a_gaussian_spot() -> None:
     np.testing.assert_allclose(make_sensor(psd('quadrant', w)).currents(np.array([[x, y]]), 1.0)[0], want, rtol=1e-9)
 
 
-def test_a_quadrants_volts_are_unbent_and_agree_with_a_lateral_one_at_the_centre() -> None:
+def test_quadrant_volts_are_linear_like_lateral_ones() -> None:
     w = 0.5e-3
     rig = rig_from_values({'psd_1.type': 'quadrant', 'psd_1.spot_radius': w, 'amplifier.sensitivity': 0.1e-3})
     calibration = VoltsToDots.from_rig(rig)
@@ -137,7 +137,7 @@ def test_other_light_is_taken_off_as_photocurrents_add() -> None:
     np.testing.assert_allclose(compensated, np.hstack(places), atol=2e-9)
 
 
-def test_a_rig_without_dark_levels_reads_as_before_and_one_without_laser_stays_finite() -> None:
+def test_dots_without_dark_levels_or_laser_are_finite() -> None:
     nominal = rig_from_values({})
     some = np.random.default_rng(1).uniform(-9.0, 9.0, (50, 6)).astype(np.float32)
     no_light = VoltsToDots.from_rig(

@@ -37,7 +37,7 @@ def test_the_weight_of_the_link_bends_it_and_turns_its_clamp() -> None:
     assert LinkStatics(length, stiffness, 1e3, clamp_bending=compliance).sag(weight) == pytest.approx(want, rel=1e-8)
 
 
-def test_a_soft_clamp_turns_by_the_moment_and_the_torque_of_a_load() -> None:
+def test_soft_clamp_rotates_by_moment_and_torque() -> None:
     soft = LinkStatics(0.585, 1529.0, 1042.0, clamp_bending=3e-5, clamp_torsion=2e-4)
     dx, dy, theta = soft.deflection(7.0, -11.0, 5.0)
     by_force = 0.585**3 / (3.0 * 1529.0) + 3e-5 * 0.585**2

@@ -37,9 +37,7 @@ EFFECT = Effect(
 """
 
 
-def test_a_calibration_takes_an_effect_of_the_users_own_for_what_it_declares(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_user_effect_is_calibrated_as_declared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'my_gain.py').write_text(OWN)
     monkeypatch.setenv(FOLDERS, str(tmp_path))
     assert catalogue()['my_gain'].calibrated_as == {'x': 'gain_x'}
@@ -94,9 +92,7 @@ def test_what_a_declaration_may_name_is_what_a_calibration_finds() -> None:
     assert set(CALIBRATED_OF_LINK) == {*CLAMP, 'link.slope_ratio'}
 
 
-def test_an_effect_that_is_declared_wrongly_is_rejected_by_its_file_and_only_if_it_is_listed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_user_effect_is_rejected_if_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'my_gain.py').write_text(OWN.replace("'gain_x'", "'gian_x'"))
     monkeypatch.setenv(FOLDERS, str(tmp_path))
     with pytest.raises(ConfigError, match=r'my_gain.py: holds no effect .*gian_x'):
@@ -128,7 +124,7 @@ def test_an_effect_listed_twice_is_rejected() -> None:
 
 
 @pytest.mark.parametrize('found', [-0.006, 0.0, 0.3])
-def test_a_slope_ratio_that_is_hardly_determined_is_written_as_one_that_a_rig_file_may_have(found: float) -> None:
+def test_undetermined_slope_ratio_is_written_valid(found: float) -> None:
     vector = vector_of_rig(RIG)
     p = vector.values.copy()
     p[INDEX['link.slope_ratio']] = found

@@ -113,7 +113,7 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('blocks', [1, 2, 25])
-def test_the_variance_of_a_zero_is_that_of_its_blocks_over_their_number(blocks: int) -> None:
+def test_zero_variance_is_block_variance_over_count(blocks: int) -> None:
     """What scatters by more than the noise says is believed; of one block there is only what the noise says."""
     rig = calibrated()
     places = np.random.default_rng(4).normal(0.0, [1e-6, 1e-9, 1e-6, 1e-9], (blocks, 4))
@@ -140,7 +140,7 @@ def test_a_zero_from_elsewhere_is_taken_for_one_of_25_blocks() -> None:
     assert (other.estimation.zero_variances, other.tip_loads.zeroed) == ((), False)
 
 
-def test_what_the_filters_covariance_holds_besides_noise_is_remembered() -> None:
+def test_systematic_covariance_of_filter_is_restored() -> None:
     """A recording begins with a block in the dark: its motion is as unsure as that of the run."""
     rig = calibrated(filter='modal')
     live, replay, without = Pipeline(rig), Pipeline(rig), Pipeline(rig)

@@ -20,7 +20,7 @@ PLACE = (0.03, -0.08)
 
 @pytest.mark.parametrize('pose', POSES)
 @pytest.mark.parametrize('height', [0.0, 0.05])
-def test_a_laser_on_the_plate_lands_where_its_ray_meets_the_surface(pose: np.ndarray, height: float) -> None:
+def test_laser_on_plate_lands_where_ray_meets_surface(pose: np.ndarray, height: float) -> None:
     plate = rotation(*pose[2:])
     start = plate @ [*PLACE, 0.0] + [pose[0], pose[1], 0.0]
     want = hit(start, plate[:, 2], np.array([0.0, 0.0, height]), np.eye(3))
@@ -63,7 +63,7 @@ def test_arrays_that_are_no_geometry_are_rejected(centers: np.ndarray, heights: 
         check_shapes(Geometry(centers, np.zeros(centers.shape), np.zeros(heights), 0.585))
 
 
-def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> None:
+def test_beams_closer_than_a_micrometre_are_rejected() -> None:
     """The rejection says where they are: at the first one's place."""
     for along in ((1.0, 0.0), (0.0, 1.0), (-0.6, 0.8)):
         for apart, message in ((0.9e-6, True), (1.1e-6, False)):

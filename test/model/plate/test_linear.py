@@ -80,7 +80,7 @@ def test_the_gain_does_not_depend_on_the_unit_of_length(golden: Any, unit: float
 
 
 @pytest.mark.parametrize(('largest', 'finite'), [(0.05, True), (0.32, True), (0.34, False), (0.6, False)])
-def test_a_bound_is_infinite_from_where_an_error_could_hide_the_pose(largest: float, finite: bool) -> None:
+def test_bound_is_infinite_where_errors_can_hide_pose(largest: float, finite: bool) -> None:
     """An error e of each entry, a tenth of it of the angle's: |G| E has the eigenvalue 3 e."""
     design = design_matrix(np.array([[0.0, 0.1], [0.0, -0.1]]))
     gain = np.abs(np.linalg.pinv(design))

@@ -134,7 +134,7 @@ def test_one_place_is_no_room_for_two_and_two_are() -> None:
     assert pair == pytest.approx(np.array([[0.0999, math.sqrt(0.1**2 - 0.0999**2)], [0.0999, 0.001]]), abs=1e-8)
 
 
-def test_the_first_of_a_ring_is_above_unless_another_azimuth_is_asked_for() -> None:
+def test_ring_starts_above_unless_azimuth_is_given() -> None:
     assert placement.opposite(0.1) == pytest.approx(np.array([[0.0, 0.1], [0.0, -0.1]]))
     assert placement.opposite(0.1, 0.3) == pytest.approx(0.1 * np.array([[c, s] for c, s in _at(0.3, 0.3 + math.pi)]))
     sixty = math.sqrt(0.75)
@@ -148,7 +148,7 @@ def _at(*angles: float) -> list[tuple[float, float]]:
     return [(math.cos(a), math.sin(a)) for a in angles]
 
 
-def test_spreads_of_what_is_observed_are_those_of_dense_least_squares() -> None:
+def test_placement_deviations_are_dense_least_squares() -> None:
     centers, heights = placement.ring(3, 0.1), np.array([0.1, -0.05, -0.05])
     pose = np.array([1e-3, -2e-3, 0.02, 0.03, -0.04])
     step = 1e-6

@@ -100,7 +100,7 @@ def test_it_is_discovered_and_named(rig: Rig, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('name', 'row'), [('temperature', 'warmer'), ('time', 't')])
-def test_a_correction_that_reads_what_it_does_not_declare_is_rejected(folder: Path, name: str, row: str) -> None:
+def test_undeclared_value_in_correction_is_rejected(folder: Path, name: str, row: str) -> None:
     (folder / f'{NAME}.py').write_text(CODE.replace("{'temperature'}", '').replace('reading.warmer', f'reading.{row}'))
     with pytest.raises(ConfigError, match=f'{NAME}.*fails on a reading.*uses'):
         Pipeline(load_rig(overrides=EFFECT))
@@ -125,7 +125,7 @@ EFFECT = Effect('heavier', 'load', 's', 'e', 's', 'n', (EffectParameter('by', ''
 """
 
 
-def test_its_load_is_traced_back_and_a_trace_that_fails_is_rejected(folder: Path) -> None:
+def test_load_is_traced_back_and_failing_trace_is_rejected(folder: Path) -> None:
     (folder / 'heavier.py').write_text(LOADED)
     rig = load_rig(overrides={'effects.heavier.by': 0.25})
     load = Pipeline(rig).tip_loads.tip_load(0, *LinkStatics.from_rig(rig).deflection(10.0, -20.0, 5.0))

@@ -73,7 +73,7 @@ def test_a_contradiction_is_rejected_and_not_simulated(more: dict[str, object], 
         RigSimulator(load_rig(overrides={**BASE, **more}))
 
 
-def test_moved_optics_are_not_corrected_as_if_the_psds_were_on_the_plate() -> None:
+def test_moved_optics_of_base_psds_are_rejected() -> None:
     moved = {'effects.a.name': 'sensor_position', 'effects.a.psd': 1, 'effects.a.x': 1e-3}
     with pytest.raises(ConfigError, match='not corrected for PSDs at the base'):
         Correction.from_rig(load_rig(overrides={**BASE, **moved}))

@@ -104,7 +104,7 @@ def hum(s: SimulatedSamples, v: Values) -> Rows:
     return {'volts': out}
 
 
-def test_a_reading_that_no_dot_could_have_is_corrected_to_something_finite() -> None:
+def test_impossible_reading_is_corrected_to_finite_value() -> None:
     """With k < 0 a dot reads at most 2/3 of sqrt(-1/(3 k)), here 4.3 mm. Beyond, it is taken where the slope is 1/10.
 
     There 1 + 3 k r^2 = 0.1, so that 1 + k r^2 = 0.7.
@@ -122,7 +122,7 @@ def test_a_reading_that_no_dot_could_have_is_corrected_to_something_finite() -> 
 
 
 @pytest.mark.parametrize('k', [1e5, -1e4])
-def test_a_bent_reading_is_straightened_to_rounding_at_the_strongest_bend(k: float) -> None:
+def test_strongest_nonlinearity_inverts_to_rounding(k: float) -> None:
     """The ends of what a coefficient may be, out to the edge of a sensor."""
     true = np.array([5e-3, -4e-3, 1e-3])
     dots = np.zeros((4, 3))

@@ -61,7 +61,7 @@ def test_a_wrong_slope_ratio_costs_little(k: float) -> None:
     np.testing.assert_allclose(rms, want, rtol=0.05)
 
 
-def test_the_printed_test_stops_at_zero_with_psd_2_on_the_other_side(rays: Any) -> None:
+def test_printed_test_stops_at_0_with_psd_2_opposite(rays: Any) -> None:
     """2.20-2.23 without magnitudes, c_2 at (+100, 0) mm, d = (1, -2) mm: 0 for 1 and 2 degrees."""
     geometry = Geometry(np.array([[0.0, 0.07], [0.1, 0.0]]), np.zeros((2, 2)), np.zeros(2), 0.585)
     for degrees, absolute in ((1.0, 0.95), (2.0, 1.95)):

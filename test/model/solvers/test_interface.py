@@ -85,9 +85,7 @@ def test_one_block_and_many_agree(golden: Any, rays: Any, method: str, options: 
 
 @pytest.mark.repeatable
 @pytest.mark.parametrize(('method', 'options'), [*SMOOTH, *STEPPED])
-def test_what_a_solver_keeps_from_block_to_block_changes_no_answer(
-    golden: Any, method: str, options: dict[str, Any]
-) -> None:
+def test_solver_cache_between_blocks_changes_no_answer(golden: Any, method: str, options: dict[str, Any]) -> None:
     """Nor does a caller who writes into a gain that he was given."""
     geometry, dots = golden.geometry(), golden.dots('G4')
     solver = make_solver(method, geometry, **options)

@@ -14,7 +14,7 @@ from psd_deflection.rig.config import load_rig
 
 @pytest.mark.parametrize('psd', [0, 1])
 @pytest.mark.parametrize('theta_sd', [0.0, 1e-4])
-def test_the_covariance_is_that_of_the_turned_reading_and_the_twist(psd: int, theta_sd: float) -> None:
+def test_covariance_is_rotated_reading_plus_twist(psd: int, theta_sd: float) -> None:
     geometry = Geometry.from_rig(load_rig())
     dot, variances, theta = np.array([2e-3, -3e-3]), np.array([4e-12, 1e-12]), 0.7
     c, s = np.cos(theta), np.sin(theta)

@@ -211,9 +211,7 @@ def test_a_half_turn_and_a_mirror_of_the_beams_rig(
 
 @many
 @given(pose=poses, tilt=tilts)
-def test_minimum_tilt_explains_the_dots_with_no_more_tilt_than_there_was(
-    golden: Any, rays: Any, pose: Any, tilt: Any
-) -> None:
+def test_minimum_tilt_explains_dots_with_least_tilt(golden: Any, rays: Any, pose: Any, tilt: Any) -> None:
     geometry = golden.geometry()
     dots = rays.tip_dots(geometry, (*pose, *tilt))
     one = make_solver('minimum_tilt', geometry).solve(tuple(dots.tolist()), ISOTROPIC)

@@ -143,9 +143,7 @@ def test_the_base_pair_is_weighted_least_squares_of_its_model(
 
 @pytest.mark.parametrize('geometry', [SKEW, FLAT_THREE])
 @pytest.mark.parametrize('method', ['exact', 'iterative'])
-def test_the_residual_is_what_the_plate_at_the_answer_does_not_explain(
-    rays: Any, method: str, geometry: Geometry
-) -> None:
+def test_residual_is_dots_minus_plate_at_answer(rays: Any, method: str, geometry: Geometry) -> None:
     variances = VARIANCES[: 2 * len(geometry.centers)]
     off = np.random.default_rng(8).normal(size=len(variances)) * 1e-4
     dots = rays.tip_dots(geometry, (2e-3, -1e-3, 0.04, 0.0, 0.0)) + off
@@ -161,7 +159,7 @@ def test_what_never_ends_is_given_up(method: str, tries: int) -> None:
     assert one.iterations == tries
 
 
-def test_newton_keeps_its_pace_where_the_dots_contradict_the_model() -> None:
+def test_newton_converges_fast_on_inconsistent_dots() -> None:
     """Half a radian from the start to the answer: the slope and its own slope must both be right."""
     variances = np.array([1e-12, 9e-10, 4e-12, 1e-10])
     dots = np.array([0.02, -0.03, -0.025, 0.03])
@@ -218,7 +216,7 @@ def of_three(**values: Any) -> Any:
     return rig_from_values({**places, 'solver': 'pose', 'solvers': ['pose'], **values})
 
 
-def test_two_of_three_psds_allow_for_the_tilt_that_they_do_not_see(rays: Any) -> None:
+def test_two_of_three_psds_allow_for_unobserved_tilt(rays: Any) -> None:
     """The middle between no tilt and a cantilever's, by least squares, and the way to either end as one more error."""
     rig, kept = of_three(), [0, 2]
     geometry = geometry_of(rig, kept)
@@ -290,7 +288,7 @@ def test_where_the_psds_are_is_reported_once() -> None:
             check_arrangement(rig_from_values({**values, 'degraded': 'none'}))
 
 
-def test_the_arrangement_is_reported_by_the_rig_or_by_the_name_of_the_solver_alone() -> None:
+def test_arrangement_comes_from_rig_or_solver_name() -> None:
     """Said by the rig, it is not changed by the name of a solver: that is rejected with the lines to write."""
     base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
     for more, at_base in (({}, True), ({'arrangement': 'base'}, True), ({'arrangement': 'tip'}, False)):
@@ -338,7 +336,7 @@ def test_options_come_from_the_rig_file() -> None:
         assert solver_class('beam').options_from_rig(rig_from_values({**two, **effect})) == {'tilt_in_dots': True}
 
 
-def test_a_quarter_turn_has_a_way_out_of_where_no_angle_is_better() -> None:
+def test_quarter_rotation_leaves_stationary_start() -> None:
     """Each dot is a quarter turn from its beam, without rounding: at angle 0 the agreement is exactly 0."""
     centers = np.array([[0.125, 0.0], [-0.125, 0.0]])
     geometry = Geometry(centers, np.zeros((2, 2)), np.zeros(2), 0.585)
@@ -370,7 +368,7 @@ def test_three_psds_at_the_base_in_two_planes_give_five_unknowns(rays: Any) -> N
     assert got[:5] == pytest.approx(five, abs=1e-12)
 
 
-def test_without_tilts_in_the_dots_beam_is_a_flat_plate_that_reports_its_tilts() -> None:
+def test_beam_without_tilt_in_dots_is_flat_with_tilts() -> None:
     """Dots whose tilts a correction has taken off, on surfaces at heights."""
     dots = (1e-3, -2e-3, 5e-4, 1e-3)
     flat = make_solver('exact', RAISED).solve(dots, VARIANCES[:4])

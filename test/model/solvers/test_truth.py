@@ -105,7 +105,7 @@ def test_a_method_is_weighted_least_squares_of_its_model(
 
 
 @pytest.mark.parametrize(('deviations', 'status'), [(2.9, SolverStatus.OK), (3.1, SolverStatus.INADMISSIBLE)])
-def test_a_base_line_is_too_short_from_three_standard_deviations_on(deviations: float, status: SolverStatus) -> None:
+def test_base_line_is_too_short_from_three_deviations(deviations: float, status: SolverStatus) -> None:
     """On a base line along x it varies as the two x readings do together."""
     geometry = Geometry(np.array([[0.1, 0.0], [-0.1, 0.0]]), np.zeros((2, 2)), np.zeros(2), 0.585)
     short = deviations * float(np.sqrt(VARIANCES[0] + VARIANCES[2]))
@@ -114,7 +114,7 @@ def test_a_base_line_is_too_short_from_three_standard_deviations_on(deviations: 
 
 
 @pytest.mark.parametrize(('k', 'taken'), [(-0.9995, False), (-0.9985, True), (-1.0005, False), (-1.0015, True)])
-def test_a_surface_at_which_the_turn_undoes_the_deflection_is_rejected(k: float, taken: bool) -> None:
+def test_surface_cancelling_deflection_is_rejected(k: float, taken: bool) -> None:
     """1 + k h/L below a thousandth."""
     geometry = Geometry(TWO.centers, TWO.zeros, np.array([0.585, 0.0]), 0.585, k)
     if taken:

@@ -158,7 +158,7 @@ def test_another_word_is_rejected(word: str) -> None:
         check_engine(word)
 
 
-def test_encryption_without_certificates_is_rejected_before_it_is_tried() -> None:
+def test_encryption_without_certificates_is_rejected() -> None:
     pytest.importorskip('distributed')
     with (
         pytest.raises(ConfigError, match=r"^--executor dask\+tls://127\.0\.0\.1:1: Dask's configuration has no cert"),

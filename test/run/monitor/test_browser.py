@@ -103,9 +103,7 @@ STICKING_OUT = """(() => {
 
 
 @pytest.mark.parametrize('how', ['node', 'alone'])
-def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
-    page: Page, start: Start, tmp_path: Path, how: str
-) -> None:
+def test_daemon_on_simulated_rig_shows_moving_dots(page: Page, start: Start, tmp_path: Path, how: str) -> None:
     if how == 'node' and importlib.util.find_spec('rclpy') is None:
         pytest.skip('the node needs rclpy: pip install .[ros]')
     arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0, monitor_control='off')]

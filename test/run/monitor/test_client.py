@@ -265,7 +265,7 @@ def test_a_load_that_is_no_number_says_so(text: str, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize('url', ['ftp://rig/', 'http://', 'http://rig:99999/', 'http://[::1/'])
-def test_an_address_that_is_none_is_a_mistake_of_the_command_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_address_is_a_usage_error(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['zero', '--url', url]) == 2
     assert f'--url = {url}: is no address' in capsys.readouterr().err
 

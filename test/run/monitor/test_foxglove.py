@@ -244,7 +244,7 @@ def deaf(served: Served) -> socket.socket:
     return one
 
 
-def test_deaf_viewers_hold_a_bounded_backlog_and_do_not_delay_the_end(served: Served) -> None:
+def test_deaf_viewers_have_bounded_backlog_and_delay_no_end(served: Served) -> None:
     ones = [deaf(served) for _ in range(VIEWERS)]
     deadline = time.monotonic() + WAIT_S
     backlogs = [_Viewer()]

@@ -171,7 +171,7 @@ def test_a_clock_that_is_far_off_for_a_moment_does_no_harm() -> None:
     assert window(made, 0, 30).columns['blocks'].sum() == 1
 
 
-def test_time_that_stands_still_and_losses_without_end_take_no_room() -> None:
+def test_constant_time_and_huge_losses_take_no_room() -> None:
     made = filled(row(START_NS, 1e-3, gone=2**60) for _ in range(5000))
     assert sum(map(len, made._values)) <= 5 * history.MOST_BLOCKS
     found = window(made, 0, 1)
@@ -249,7 +249,7 @@ def test_all_time_may_be_asked_for() -> None:
     assert (found.columns['blocks'].tolist(), found.width_ns) == ([200], 9_000_000 * SECOND)
 
 
-def test_a_cell_that_is_too_old_for_its_place_does_not_take_it_back() -> None:
+def test_outdated_cell_does_not_replace_newer_cell() -> None:
     """Cells 1 and 4 of a ring of three share a place, in which an old one still lies."""
     ring = history.Ring(1, 3, history.cell_kind(3))
     cells = np.full(2, history.empty_cell(history.cell_kind(3)), history.cell_kind(3))
@@ -262,7 +262,7 @@ def test_a_cell_that_is_too_old_for_its_place_does_not_take_it_back() -> None:
     assert int(ring.between(4, 5)['blocks'][0]) == 2
 
 
-def test_marks_are_to_be_kept_at_first_and_when_there_are_new_ones() -> None:
+def test_marks_are_unsaved_at_first_and_after_new_ones() -> None:
     made = History(2, SIZE, SMALL)
     # None yet: the file may have some of a run before.
     assert made.unsaved().marks == []

@@ -104,7 +104,7 @@ def test_a_mark_a_gap_and_an_alarm_are_observed_in_the_hour(page: Page, hour: Se
 
 
 @pytest.mark.slow
-def test_the_cell_under_the_cursor_is_reported_and_a_stretch_is_asked_for_anew(page: Page, hour: Serving) -> None:
+def test_cell_under_cursor_is_reported_and_zoom_loads(page: Page, hour: Serving) -> None:
     page.open(hour.url)
     page.until('document.body.dataset.rows > 0')
     choose(page, '24 h')

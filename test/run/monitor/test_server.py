@@ -141,9 +141,7 @@ def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> Non
         ({'monitor_control': 'off', 'monitor_address': '0.0.0.0'}, 'switched off'),
     ],
 )
-def test_the_buttons_are_off_on_the_network_and_if_they_are_switched_off(
-    serve: Serve, overrides: dict[str, object], reason: str
-) -> None:
+def test_buttons_are_off_on_network_and_when_disabled(serve: Serve, overrides: dict[str, object], reason: str) -> None:
     serving = serve(**overrides)
     url = f'http://127.0.0.1:{serving.port}/'
     for path in ('api/zero', 'api/record', 'api/load', 'api/mark', 'api/play'):

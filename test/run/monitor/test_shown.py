@@ -39,7 +39,7 @@ def source_of(name: str, feed: Feed, message: list[str], ended: threading.Event,
     return ShownRecording(name, open_steps, feed, log, speed=speed, inputs=inputs)
 
 
-def test_rates_are_of_a_second_however_long_ago_the_last_report_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_are_per_second_for_any_report_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('psd_deflection.run.monitor.shown_recording.time.time_ns', lambda: 0)
     ended = threading.Event()
     source = source_of('clean', Feed(), list[str](), ended)
@@ -85,7 +85,7 @@ class Heard(Feed):
             self.estimated.set()
 
 
-def test_a_zero_does_not_wait_for_the_next_block_of_a_slow_recording() -> None:
+def test_zero_is_not_delayed_by_slow_recording() -> None:
     feed, stated = Heard(), list[str]()
     # The next block comes two seconds later, the longest wait; a request is answered at once.
     source = source_of('clean', feed, stated, threading.Event(), speed=1e-3)

@@ -123,7 +123,7 @@ def entry_of(volts: npt.NDArray[np.float64]) -> DiagnosticEntry:
 
 
 @pytest.mark.parametrize('hz', [40.0, 1040.0, 960.0])
-def test_a_line_without_a_mode_is_reported_with_all_that_it_may_be(hz: float) -> None:
+def test_line_without_mode_has_alternatives(hz: float) -> None:
     """The samples of 40, 960 and 1040 Hz are the same."""
     noise = np.random.default_rng(1).normal(0.0, 2e-3, 4000)
     entry = entry_of(noise + 0.04 * np.sin(2.0 * np.pi * hz * np.arange(4000) * 1e-3))

@@ -17,9 +17,7 @@ def test_a_library_that_is_new_enough_is_taken(monkeypatch: pytest.MonkeyPatch, 
 
 
 @pytest.mark.parametrize('version', ['3.8.4', '2.99.0'])
-def test_a_library_that_would_not_answer_is_rejected_by_its_version(
-    monkeypatch: pytest.MonkeyPatch, version: str
-) -> None:
+def test_outdated_library_is_rejected_by_version(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
     monkeypatch.setattr('importlib.metadata.version', lambda _: version)
     with pytest.raises(ConfigError, match=rf'needs aiohttp 3\.9 or later, {version} is installed'):
         need_server()

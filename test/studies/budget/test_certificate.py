@@ -149,9 +149,7 @@ def test_a_parameter_that_is_known_exactly_has_no_correlation() -> None:
 
 
 @pytest.mark.parametrize(('rows', 'outliers', 'freedom'), [(60, 0, 58.0), (10, 7, 1.0), (10, 8, 1.0), (10, 6, 2.0)])
-def test_a_fit_without_more_frames_than_parameters_has_one_degree_of_freedom(
-    rows: int, outliers: int, freedom: float
-) -> None:
+def test_fit_with_few_frames_has_one_degree_of_freedom(rows: int, outliers: int, freedom: float) -> None:
     tree = {**_tree(), 'reference': {'rows': rows, 'outliers': outliers}}
     assert certify(_problem(calibration=tree)).inputs[0].freedom == freedom
 
@@ -184,7 +182,7 @@ def test_a_doubt_about_the_reference_is_its_degrees_of_freedom(doubt: float, fre
     assert [row.freedom for row in rows] == pytest.approx([freedom, freedom])
 
 
-def test_a_shift_of_a_reading_moves_each_pose_as_least_squares_has_it(certificate: Certificate) -> None:
+def test_reading_shift_moves_pose_as_least_squares(certificate: Certificate) -> None:
     noise = [row for row in certificate.inputs if row.cause == 'amplifier_noise']
     p = vector_of_rig(RIG).as_used
     for n, pose in enumerate(POSES):
@@ -197,7 +195,7 @@ def test_a_shift_of_a_reading_moves_each_pose_as_least_squares_has_it(certificat
 # ---- The sums ----
 
 
-def test_without_poses_they_are_rest_and_the_ends_of_what_was_observed() -> None:
+def test_default_poses_are_rest_and_observed_extremes() -> None:
     expected = [
         (0.0, 0.0, 0.0),
         (-2e-3, 0.0, 0.0),

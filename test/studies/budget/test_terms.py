@@ -50,7 +50,7 @@ def test_every_row_of_table_3_1_is_there() -> None:
     assert len(set(names)) == len(names)
 
 
-def test_terms_name_inputs_that_there_are_and_each_input_serves_a_term() -> None:
+def test_terms_name_known_inputs_and_inputs_are_used() -> None:
     declared = {i.parameter.name for i in INPUTS}
     used = {name for c in CAUSES for name in c.inputs}
     # How well deviations are known serves every term's degrees of freedom.

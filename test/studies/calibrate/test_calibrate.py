@@ -81,7 +81,7 @@ def test_the_noise_of_reference_and_channels_is_reported(nominal: Rig, pose: Flo
     assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
 
 
-def test_what_the_recording_cannot_show_keeps_value_and_tolerance(nominal: Rig) -> None:
+def test_undetermined_parameter_keeps_value_and_sd(nominal: Rig) -> None:
     """Forces along Y alone move no dot along x and turn nothing."""
     rng = np.random.default_rng(4)
     loads = misaligned.pushes(rng, 12, 2.0) * (0.0, 1.0, 0.0)
@@ -212,9 +212,7 @@ def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     assert abs(value - 0.03) < 4.0 * sd
 
 
-def test_what_the_rows_contradict_is_widened_once_each_the_worst_first(
-    nominal: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_contradicted_priors_widen_once_worst_first(nominal: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """A clamp, too: it has no parameter in the rig file that the other numbers are counted by."""
     prior = prior_of_rig(nominal)
     worst, next_one = AT['clamp.bending_compliance'], AT['psd_1.rotation']

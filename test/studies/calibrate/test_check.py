@@ -48,7 +48,7 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
     assert [s for _, s in found.shifts.values()] == pytest.approx(sd.tolist())
 
 
-def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
     reported = prior_of_rig(rig_from_values({}))
     names = [p.name for p in PARAMETERS if p.group == 'psd_1.gain']
     given: list[Prior] = []
@@ -75,7 +75,7 @@ def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypat
 
 
 @pytest.mark.parametrize(('shared', 'least', 'most'), [(0.0, 0.042, 0.055), (0.9, 0.005, 0.055)])
-def test_at_most_five_per_cent_of_rigs_are_reported_to_have_moved(shared: float, least: float, most: float) -> None:
+def test_at_most_5_percent_of_sound_rigs_are_reported(shared: float, least: float, most: float) -> None:
     """20,000 rigs in which nothing moved, of as many groups as there are, independent or with a common part."""
     groups = len({p.group for p in PARAMETERS[:ZERO]})
     rng = np.random.default_rng(8)
@@ -86,7 +86,7 @@ def test_at_most_five_per_cent_of_rigs_are_reported_to_have_moved(shared: float,
     assert (LEVEL, overall_p([]), overall_p([0.4, 0.9])) == (0.05, 1.0, 0.8)
 
 
-def test_what_no_row_reports_is_undetermined_alone_or_as_a_combination() -> None:
+def test_uninformed_parameters_are_undetermined() -> None:
     prior = prior_of_rig(rig_from_values({}))
     size = len(prior.mean)
     free = np.ones(size, dtype=bool)
@@ -109,7 +109,7 @@ def test_what_no_row_reports_is_undetermined_alone_or_as_a_combination() -> None
     assert (abs(one), one + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
 
 
-def test_a_clamp_that_gives_way_is_found_beside_a_pose_that_is_an_outlier() -> None:
+def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
     rig = rig_from_values({})
     prior = prior_of_rig(rig)
     n, size = 40, len(prior.mean)

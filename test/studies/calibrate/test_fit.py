@@ -53,7 +53,7 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
         assert misfit(pose, row) == pytest.approx(best.fun, abs=1e-3)
 
 
-def test_a_clamp_may_give_way_by_a_fifth_of_the_links_own_compliance() -> None:
+def test_clamp_prior_is_a_fifth_of_link_compliance() -> None:
     """In the deflection by a tip force, L^3/3EI, and in the twist by a moment, L/GJ."""
     rig = rig_from_values({})
     bends, twists = prior_of_rig(rig).sd[CLAMP_AT : CLAMP_AT + 2]

@@ -42,7 +42,7 @@ def on_curves(t: FloatArray, derivative: int = 0) -> FloatArray:
     return np.stack(columns, axis=1) / 0.02**derivative
 
 
-def test_a_polynomial_of_the_degree_of_the_fit_is_found_with_its_slope() -> None:
+def test_polynomial_of_fit_degree_is_found_with_slope() -> None:
     found = smoothed(on_curves(T), PERIOD, WHERE)
     assert found.good.all()
     scale = np.abs(on_curves(T)).max()
@@ -51,7 +51,7 @@ def test_a_polynomial_of_the_degree_of_the_fit_is_found_with_its_slope() -> None
     assert found.squares.max() < 1e-18 * scale
 
 
-def test_the_gain_is_the_variance_of_the_value_over_that_of_a_sample() -> None:
+def test_gain_is_value_variance_over_sample_variance() -> None:
     found = smoothed(np.zeros((200, 4)), PERIOD, WHERE)
     for place, gain in zip(WHERE, found.gain, strict=True):
         middle = round(place)
@@ -109,7 +109,7 @@ def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
     assert not at_rest(None, t).any()
 
 
-def test_rows_without_a_reference_are_one_a_block_and_know_what_a_sample_knows() -> None:
+def test_rows_without_reference_are_one_per_block() -> None:
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     loads = np.tile([0.0, -5.0, 1.0], (2000, 1))
     rows = rows_of(run_of(lit(2000, (0.0, 0.0, 0.0, 0.0)), loads), RIG, noise)

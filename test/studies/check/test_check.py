@@ -235,7 +235,7 @@ def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> No
     assert dict(found.values) == lines_of(turn)
 
 
-def test_loads_that_say_nothing_and_samples_with_gaps_are_no_accident() -> None:
+def test_uninformative_loads_or_gaps_cannot_tell() -> None:
     loads = pushes(10.0)
     volts = recorded(loads, 1)
     assert checked(volts, np.zeros_like(loads)).verdict == CANNOT_TELL
@@ -346,9 +346,7 @@ def test_loads_and_ringing_are_no_drift(
     assert not any('drift' in note for note in found['notes'])
 
 
-def test_a_drift_under_a_staircase_of_loads_is_found_to_a_hundredth(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drift_under_load_steps_is_found_to_1_percent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # 4.5 um/K over 4 K in a minute.
     hidden = ('--temperature', '20,24', '--effect', 'thermal_drift,psd=1,x=4.5e-6')
     found = drift_of(tmp_path, capsys, '--loads', SWAYS[0].replace(':9', ':15'), *hidden)
@@ -358,9 +356,7 @@ def test_a_drift_under_a_staircase_of_loads_is_found_to_a_hundredth(
 
 
 @pytest.mark.slow
-def test_a_weight_that_is_taken_off_moves_the_dots_by_what_it_held(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_removed_weight_moves_dots_by_what_it_held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = load_rig()
     before, after = ForwardModel(rig, settled=True).run(np.array([[0.0, 0.0, 0.0], [0.0, -50.0, -29.25]])).true_dots.T
     made = str(tmp_path / 'made')

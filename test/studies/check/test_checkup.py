@@ -68,7 +68,7 @@ def of(found: Checkup) -> list[tuple[str, str]]:
 # ---- which channel does not answer
 
 
-def test_a_channel_is_dead_that_moves_less_than_a_tenth_of_every_push() -> None:
+def test_channel_below_a_tenth_of_every_push_is_dead() -> None:
     def with_share(share: float, only_twist: bool = False) -> Checkup:
         fx = replace(push('fx'), channels=np.array([share, 0.0, math.sqrt(1.0 - share**2), 0.0]) * -1e-4)
         turn = replace(push('tz'), channels=np.array([0.0, 0.0, 0.0, 1e-4]), only_twist=only_twist)
@@ -88,7 +88,7 @@ def test_a_channel_is_dead_that_moves_less_than_a_tenth_of_every_push() -> None:
     assert ('stuck_channel', 'x1') not in of(checked([dead, rotated]))
 
 
-def test_a_channel_that_is_stuck_is_reported_once_and_no_wiring_then() -> None:
+def test_stuck_channel_is_reported_once_without_wiring() -> None:
     dead = replace(push('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
     found = checked([dead, push('fy')], of_levels(stuck=('x1', 'sum2')))
     assert of(found) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]

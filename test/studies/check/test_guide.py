@@ -136,7 +136,7 @@ FAR = (0.0, 300 * MICRO, 0.0, -400 * MICRO)
 """Half a millimetre away."""
 
 
-def test_rest_takes_two_seconds_and_a_push_and_letting_go_six_tenths_each() -> None:
+def test_rest_takes_2_s_and_push_and_release_0_6_s() -> None:
     fed = Fed()
     guide = fed.guide
     assert fed.at(Phase.REST, 0.0)
@@ -191,7 +191,7 @@ def test_pieces_of_any_length_count_by_their_samples() -> None:
 
 
 @pytest.mark.parametrize(('shaking', 'rests'), [(1.10 * MICRO, True), (1.14 * MICRO, False)])
-def test_rest_wanders_by_no_more_than_five_times_the_noise_of_a_block(shaking: float, rests: bool) -> None:
+def test_rest_motion_limit_is_five_times_block_noise(shaking: float, rests: bool) -> None:
     # 2 mV are 1 um a sample; of a block of 20 five deviations are 1.118 um.
     fed = Fed()
     message = fed.feed(NOTHING, WAIT - 1, shaking)
@@ -209,7 +209,7 @@ def test_rest_wanders_by_no_more_than_five_times_the_noise_of_a_block(shaking: f
         assert fed.at(Phase.PUSH)
 
 
-def test_rest_of_a_quiet_rig_may_still_wander_by_a_tenth_of_the_least_push() -> None:
+def test_rest_motion_limit_is_at_least_a_tenth_of_push() -> None:
     quiet = load_rig(overrides={'amplifier.noise': 1e-5})
     for shaking, rests in ((0.99 * MICRO, True), (1.01 * MICRO, False)):
         fed = Fed(quiet)
@@ -241,14 +241,14 @@ def test_a_push_stands_out_of_the_rest(shaking: float, size: float, taken: bool)
 
 
 @pytest.mark.parametrize(('shaking', 'taken'), [(149.0, True), (151.0, False)])
-def test_a_push_is_held_if_it_wanders_by_less_than_three_tenths_of_it(shaking: float, taken: bool) -> None:
+def test_push_is_held_if_it_moves_below_three_tenths(shaking: float, taken: bool) -> None:
     fed = Fed().rested()
     message = fed.feed(FAR, WAIT + 1, shaking * MICRO)
     assert any(text.startswith('Got it') for text in message) is taken
     assert ('Hold it steadier.' in message) is not taken
 
 
-def test_a_dot_at_the_end_of_its_range_is_reported_though_it_is_held() -> None:
+def test_dot_at_range_end_is_reported_though_held() -> None:
     # Two counts below 10 V are the end; half a millimetre is a volt.
     step = 20.0 / 2**16
     for volt, ends in ((10.0 - 2.0 * step, True), (10.0 - 2.5 * step, False)):
@@ -311,7 +311,7 @@ def test_one_rest_alone_has_no_drift() -> None:
     assert (sd > 1e-3).all()
 
 
-def test_the_landmark_is_the_psd_that_lies_farthest_out_along_the_axis() -> None:
+def test_landmark_is_outermost_psd_along_axis() -> None:
     rig = load_rig(overrides={'psd_1.center': [0.03, -0.08], 'psd_2.center': [-0.02, 0.05]})
     first, second, _ = directions(rig)
     assert first == 'Push the tip along +X (towards the PSD at x 30 mm, y -80 mm) and hold it.'

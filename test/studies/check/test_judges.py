@@ -80,9 +80,7 @@ def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float
     assert reported == units
 
 
-def test_check_and_discover_name_a_converter_that_is_coarser_than_the_file_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_and_discover_name_coarser_converter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, found = tmp_path / 'run.csv', tmp_path / 'found'
     assert main(['simulate', '--out', str(run), '--loads', 'thesis:1', '--world', 'converter.bits=10']) == 0
     assert main(['discover', str(run), '--out', str(found), '--quiet']) == 0
@@ -112,7 +110,7 @@ def test_a_channel_within_a_coarse_step_is_not_dead() -> None:
     assert levels(RIG, volts).stuck == ('sum2',)
 
 
-def test_the_noise_of_steps_is_their_size_over_the_root_of_twelve() -> None:
+def test_quantisation_noise_is_step_over_root_12() -> None:
     stated = math.hypot(2e-3, 0.05 / math.sqrt(12.0))
     steps = np.full((2, 2), 0.05)
     (found,), lines = shared_findings.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)

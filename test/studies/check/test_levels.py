@@ -56,7 +56,7 @@ def test_noise_is_that_of_third_differences() -> None:
     assert levels(RIG, still).noise == pytest.approx(math.sqrt((1 + 4 + 1) * 16 / 897 / 20) * STEP, rel=0.5)
 
 
-def test_a_channel_on_which_no_bit_moves_is_stuck_if_noise_would_move_one() -> None:
+def test_constant_channel_is_stuck_if_noise_moves_bits() -> None:
     volts = noisy(200)
     volts[:, [1, 5]] = 0.25
     assert levels(RIG, volts).stuck == ('y1', 'sum2')

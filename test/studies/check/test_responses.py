@@ -34,7 +34,7 @@ def at_rest(rig: Rig, load: tuple[float, float, float]) -> FloatArray:
 
 
 @pytest.mark.parametrize('rig', [RIG, GAINS, ZEROS], ids=['alike', 'other sensitivities', 'dots beside the centre'])
-def test_each_push_moves_the_channels_by_what_its_load_moves_at_rest(rig: Rig) -> None:
+def test_push_moves_channels_as_its_load_does_at_rest(rig: Rig) -> None:
     loads = held((0, 0, 0), (5, 0, 0), (0, 0, 0), (0, 8, 0), (0, -10, 0), (0, 0, 3), (0, 0, 0))
     volts = of_loads(rig, loads)
     # A drift of 1 um/s on x2.

@@ -147,7 +147,7 @@ def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
     assert len(first.parts) == 1
 
 
-def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> None:
+def test_push_rows_list_expected_channels_of_rig_file() -> None:
     head, along, beside = push_rows(CHECKUP)
     assert head == ['push', 'x1 µm', 'y1 µm', 'x2 µm', 'y2 µm', '', 'x1', 'y1', 'x2', 'y2', 'size']
     # The file has x1 turned; a hundredth of the whole is next to nothing. By hand there is no size.
@@ -179,7 +179,7 @@ def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> Non
     ]
 
 
-def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
+def test_levels_are_in_mv_and_drift_in_um_per_minute() -> None:
     assert level_rows(CHECKUP) == [
         ('noise', 'x1 1.00  y1 2.00  sum1 3.00  x2 4.00  y2 5.00  sum2 6.50  mV rms a sample (rig file 2.20)'),
         ('hum', 'none at 50 or 60 Hz'),

@@ -79,7 +79,7 @@ def test_a_push_is_observed_beyond_six_deviations(
     assert push(channels, sd=sd, only_twist=only_twist).observed is observed
 
 
-def test_the_misfit_is_the_share_of_the_square_that_the_pattern_leaves() -> None:
+def test_unexplained_share_is_square_outside_pattern() -> None:
     # (3, 4) along (2, 0): 1.5 times as large, and 16 of 25 are left.
     assert push([3.0, 4.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]).misfit(PLAIN) == pytest.approx((0.64, 1.5))
     assert push([-3.0, 0.0, 0.0, 4.0], [2.0, 0.0, 0.0, 0.0]).misfit(PLAIN) == pytest.approx((0.64, -1.5))

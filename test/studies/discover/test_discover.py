@@ -139,7 +139,7 @@ def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
 
 
 @pytest.mark.slow
-def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
+def test_sizes_agreeing_beyond_chance_share_a_cause() -> None:
     lag = observe(with_effect('amplifier_lag', time_constant=3e-5))
     near = {*NEAR} - {'amplifier_lag'}
     found = discover([lag], RIG, without=[n for n in effect_names() if n not in near], bank=BANK)
@@ -210,9 +210,7 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ('effect', 'wrong'), [('sensor_rotation,psd=1,angle=0.02', True), ('amplifier_lag,time_constant=2e-4', False)]
 )
-def test_what_an_estimate_is_wrong_by_is_what_the_model_changes_in_a_replay(
-    effect: str, wrong: bool, tmp_path: Path
-) -> None:
+def test_estimate_error_is_change_by_model_in_replay(effect: str, wrong: bool, tmp_path: Path) -> None:
     assert main(['simulate', '--out', str(tmp_path / 'a'), '--loads', 'thesis:1', '--effect', effect]) == 0
     found = psd_deflection.discover([tmp_path / 'a'])
     (tmp_path / 'model.yaml').write_text(found.model_yaml())

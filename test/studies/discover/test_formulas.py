@@ -73,7 +73,7 @@ def script(levels: list[tuple[float, float, float]], dwell: float) -> tuple[str,
         (Limits(sweep=900.0), ['2,40:15', '40,400:12']),
     ],
 )
-def test_sweeps_go_as_high_as_the_exciter_and_the_samples_let_them(limits: Limits, ends: list[str]) -> None:
+def test_sweeps_reach_limit_of_exciter_and_samples(limits: Limits, ends: list[str]) -> None:
     """Up to four tenths of the sample rate."""
     chirps = [p.script[0] for p in pieces(RIG, limits) if p.script[0].startswith('chirp')]
     assert [c.split(':', 2)[2] for c in chirps] == ends
@@ -101,7 +101,7 @@ def test_lesser_forces_torques_and_times_are_kept() -> None:
     ] or only_torque[2].words.startswith('0 N on the sidebar')
 
 
-def test_settings_are_lengths_rates_and_temperatures_other_than_now() -> None:
+def test_settings_are_lengths_rates_and_temperatures() -> None:
     limits = Limits(swing=4.0, lengths=(0.4, RIG.link.length, 0.9), rates=(500.0, 1000.0))
     got = settings(RIG, limits)
     assert [(s.words, dict(s.changes), s.swing) for s in got] == [
@@ -144,7 +144,7 @@ def some_shown(rng: np.random.Generator, seconds: float = 2.0) -> tuple[ModelSum
     return ModelSums(apart, pull, [c.T @ c for c in slopes], seconds), rows, slopes
 
 
-def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:
+def test_separation_is_residual_of_both_recordings() -> None:
     """The other model adapts to the new data and to the old, whose curvature is known."""
     rng = np.random.default_rng(3)
     observed, rows, slopes = some_shown(rng)

@@ -40,7 +40,7 @@ def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
 
 
 @pytest.mark.slow
-def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> None:
+def test_rounded_loads_are_reported_beside_effect() -> None:
     odd = LEVELS + np.array(
         [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
     )
@@ -54,7 +54,7 @@ def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> N
 
 
 @pytest.mark.slow
-def test_a_lag_of_the_amplifiers_is_found_beside_fitted_times_which_follow_it() -> None:
+def test_amplifier_lag_is_found_beside_fitted_times() -> None:
     """All times a little later leave of a lag only what bends; and they are settled again beside it."""
     annotated = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
@@ -75,7 +75,7 @@ OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0
 
 
 @pytest.mark.slow
-def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search() -> None:
+def test_proportional_rounded_loads_are_checked_first() -> None:
     found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0)), np.repeat(ROUNDED, DWELL, axis=0))
     assert [(f.name, f.where) for f in found.setup] == [('load_value', f'load {i}') for i in range(1, 7)]
     assert '(31.03 N, -51.71 N, 0 N m) hung, not (30 N, -50 N, 0 N m)' in found.setup[5].fix
@@ -93,7 +93,7 @@ def test_the_noise_of_a_load_cell_is_no_effect() -> None:
 
 
 @pytest.mark.slow
-def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wrong() -> None:
+def test_link_effect_blames_no_detector_or_estimate() -> None:
     found = searched(read(HELD, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HELD)
     (effect,) = found.effects
     assert effect.active.effect.stage == 'link'
@@ -105,7 +105,7 @@ def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wron
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.02, 1.0), (1.0, 0.97), (0.96, 1.05)])
-def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bending: float, torsion: float) -> None:
+def test_other_natural_frequencies_are_rig_file_lines(bending: float, torsion: float) -> None:
     true = {'dynamics__bending_frequency': 14.0 * bending, 'dynamics__torsion_frequency': 21.0 * torsion}
     found = searched(read(HELD, **true), HELD)
     wrong = {key: f for key, f in (('bending', bending), ('torsion', torsion)) if f != 1.0}
@@ -125,7 +125,7 @@ def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bendi
 
 
 @pytest.mark.slow
-def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> None:
+def test_lower_bending_frequency_alone_may_be_tip_mass() -> None:
     found = searched(read(HELD, dynamics__bending_frequency=14.0 * 0.97), HELD)
     assert [(e.name, e.equivalent) for e in found.effects] == [('tip_mass', ('bending_frequency',))]
     assert found.setup == ()
@@ -221,7 +221,7 @@ def test_free_times_are_settled_again_if_an_effect_fails() -> None:
 
 
 @pytest.mark.slow
-def test_a_link_that_rings_on_through_loads_applied_slowly_has_its_damping() -> None:
+def test_ringing_link_under_slow_loads_has_its_damping() -> None:
     """What rings outlasts what is left out, and a search begins far from it."""
     t = np.arange(len(HELD)) / 1000.0
     acting = np.tile(LEVELS[0], (len(HELD), 1))
@@ -268,7 +268,7 @@ def test_a_motion_that_nobody_noted_changes_no_load_that_was() -> None:
     assert ws.with_loads([(replace(swings, swings=False), 2.0)]).observations[0].loads[7000, 0] == HELD[7000, 0] + 2.0
 
 
-def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> None:
+def test_load_time_is_unseen_in_excluded_samples() -> None:
     volts = read(HELD)
     volts[7900:9000] = np.nan
     volts[3900:4100, 0] = np.nan
@@ -281,7 +281,7 @@ def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> No
 
 
 @pytest.mark.slow
-def test_two_effects_under_loads_in_whole_steps_are_no_rounded_loads() -> None:
+def test_two_effects_are_no_rounded_loads() -> None:
     """One of them moves the plate as a load does. Whether loads were rounded is asked first, at no search's expense."""
     two = {**ROTATED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}
     found = searched(read(HELD, **two), HELD)

@@ -212,7 +212,7 @@ def test_between_two_loads_any_level_is_as_good(observed: tuple[Workspace, Fit])
 # Laws and their fits.
 
 
-def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
+def test_fitted_law_has_fit_numbers_and_deviations() -> None:
     law = Law(
         'law_y2', 'psd', 'y2', (LawTerm('above', ('load_fy',), shapes={'threshold': 4.0}), LawTerm('product', ('dx',)))
     )
@@ -247,7 +247,7 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
     assert laws.term_covariance(same)[3, 3] > 1e6 * covariance[3, 3]
 
 
-def test_terms_are_added_to_the_law_on_their_quantity_and_left_out_one_by_one() -> None:
+def test_terms_join_law_of_quantity_and_leave_singly() -> None:
     a, b, c = (LawTerm('product', (v,)) for v in ('load_fx', 'load_fy', 'load_tz'))
     first = Law('law_y2', 'psd', 'y2', (a,))
     (both,) = laws.with_term([first], law_features.Scored('y2', b, 1.0))
@@ -317,7 +317,7 @@ def test_variances_are_the_likeliest() -> None:
     assert variance.variance(np.full(10, 1e-6), np.linspace(0.0, 1.0, 10)) == pytest.approx((0.05, 0.0), abs=1e-9)
 
 
-def test_noise_that_grows_with_a_load_is_reported_with_its_size_and_evidence() -> None:
+def test_noise_growing_with_load_has_size_and_evidence() -> None:
     """Against the likelihoods of the same squares, counted here."""
     rng = np.random.default_rng(5)
     o = make_observation(6)

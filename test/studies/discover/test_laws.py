@@ -55,9 +55,7 @@ def test_there_is_no_law_in_noise() -> None:
 
 
 @pytest.mark.slow
-def test_a_law_is_reported_adopted_and_then_explains_the_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_law_is_adopted_and_explains_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs, ours = tmp_path / 'theirs', tmp_path / 'ours'
     theirs.mkdir()
     ours.mkdir()
@@ -123,7 +121,7 @@ def test_what_switches_with_the_loads_is_no_law_of_times() -> None:
         assert switched is reported
 
 
-def test_a_law_that_leaves_much_on_unseen_cases_is_reported_and_not_written() -> None:
+def test_law_with_large_held_out_gap_is_not_written() -> None:
     ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
     null = refit(ws, ())
     found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)

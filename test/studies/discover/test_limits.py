@@ -144,7 +144,7 @@ def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
     assert got == pytest.approx(want)
 
 
-def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted() -> None:
+def test_localisation_is_independent_of_fit_units() -> None:
     workspace = Workspace([make_observation(warm=None)])
     known = np.random.default_rng(3).standard_normal((len(workspace.whiten(workspace.measured)), 2))
     residual = workspace.residual([])[0]
@@ -188,7 +188,7 @@ def test_of_two_that_are_one_the_sum_is_known() -> None:
     np.testing.assert_allclose(twice.covariance(), 0.25 * fit.covariance()[0, 0] * np.ones((2, 2)), rtol=1e-6)
 
 
-def test_a_variable_is_known_as_means_of_the_blocks_of_an_estimate() -> None:
+def test_variable_is_known_as_means_of_estimate_blocks() -> None:
     workspace = Workspace([make_observation(warm=None), make_observation(1, name='second', warm=None)])
     for o, got in zip(workspace.observations, law_features.known_values(workspace, (), 'load_fy'), strict=True):
         np.testing.assert_allclose(got, o.loads[:, 1].reshape(-1, 20).mean(axis=1), atol=1e-12)

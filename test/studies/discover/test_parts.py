@@ -97,7 +97,7 @@ def test_noise_has_a_floor_of_its_file() -> None:
     assert ws.renoised([make_active('creep', {'amplitude': 0.01}, 't')]) is ws
 
 
-def test_a_slow_change_is_unwhitened_by_what_is_left_of_a_constant() -> None:
+def test_slow_change_is_unwhitened_as_a_constant() -> None:
     ws = Workspace([make_observation(warm=None)])
     ar = np.array([[0.5, -0.2], [0.3, 0.0], [0.97, 0.0], [0.0, 0.0], [-0.6, 0.1], [0.2, 0.2]])
     ws = ws.replaced(noise=(dataclasses.replace(ws.noise[0], ar=ar),))

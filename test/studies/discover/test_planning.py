@@ -182,7 +182,7 @@ class Searches:
         return loop.run_loop([first], self.search, lambda plan, number: made, most=most)
 
 
-def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loop_ends_without_useful_or_allowed_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     done = Searches(monkeypatch, 2, useful=False).settle()
     assert (done.outcome, len(done.plans)) == ('limits', 0)
     assert done.sentence.endswith('Nothing helps.')

@@ -51,7 +51,7 @@ def apart(shown: dict[tuple[str, str], FloatArray], first: tuple[str, str], othe
 
 
 @pytest.mark.repeatable
-def test_each_step_adds_what_it_finds_and_changes_nothing_before_it() -> None:
+def test_step_adds_results_and_changes_no_earlier_ones() -> None:
     shown = pictures(A, B, ('c', 'x'))
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     first = begun(Library(plant))
@@ -85,7 +85,7 @@ def test_nothing_is_missing_in_noise() -> None:
     assert fields['gap_before'] == fields['gap_after'] == fields['gap_heldout_after']
 
 
-def test_what_remains_somewhere_is_unknown_and_takes_weak_effects_with_it() -> None:
+def test_unexplained_remainder_drops_weak_effects() -> None:
     shown = pictures(A)
     plant = Plant(shown, without_noise((shown[A], 200.0)) + noise())
     # Faster than blocks, so that no gap has it.
@@ -100,9 +100,7 @@ def test_what_remains_somewhere_is_unknown_and_takes_weak_effects_with_it() -> N
 
 
 @pytest.mark.parametrize(('of_effect', 'found'), [(0.0, ['link_length']), (0.3, ['b', 'c'])])
-def test_a_mistake_with_an_effect_beside_it_must_be_better_than_effects_alone(
-    of_effect: float, found: Sequence[str]
-) -> None:
+def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, found: Sequence[str]) -> None:
     """Length and one effect explain as much as two effects do: then it is the effects."""
     length, b, c = ('link_length', 'x'), ('b', 'x'), ('c', 'x')
     shown = pictures(length, b, c)
@@ -120,7 +118,7 @@ def test_a_mistake_with_an_effect_beside_it_must_be_better_than_effects_alone(
     assert plant.first == FIRST
 
 
-def test_without_one_effect_the_others_are_fitted_and_weighed_anew() -> None:
+def test_others_are_refitted_without_removed_effect() -> None:
     shown = pictures(A, B)
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     both = weigh(search(begun(Library(plant))))
@@ -135,7 +133,7 @@ def test_without_one_effect_the_others_are_fitted_and_weighed_anew() -> None:
     assert none.fit is one.result.null
 
 
-def test_the_gap_before_is_that_of_the_recording_as_it_was_stated() -> None:
+def test_gap_before_is_that_of_original_recording() -> None:
     shown = pictures(A)
     last = solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
     assert dataclasses.replace(last, stated_gap=7.0).gap_before == 7.0

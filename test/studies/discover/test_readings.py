@@ -58,9 +58,7 @@ SOFT = make_active('bending_stiffness', {'scale': -0.05}, 'test')
 ROTATED = make_active('sensor_rotation', {'psd': 2, 'angle': 0.02}, 'test')
 
 
-def test_a_table_names_what_the_rig_lacks_and_model_yaml_repairs_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([SOFT]).values)
     assert main(['discover', str(table), '--out', str(tmp_path / 'found')]) == 0
     answer = capsys.readouterr()
@@ -82,7 +80,7 @@ def test_tables_of_two_lengths_report_stiffness_from_the_clamp() -> None:
     assert effect.active.values['scale'] == pytest.approx(-0.05, abs=0.002)
 
 
-def test_estimates_show_a_turned_sensor_and_poses_of_another_device_do_not() -> None:
+def test_estimates_show_rotated_sensor_unlike_poses() -> None:
     found = discover_in(ReadingsPlant([read([ROTATED], 'estimates')], without=['axis_crosstalk']))
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
     assert discover_in(ReadingsPlant([read([ROTATED], 'poses')])).verdict == 'nothing_missing'
@@ -180,7 +178,7 @@ def test_a_table_that_lacks_something_says_what(tmp_path: Path, text: str, words
         read_tables([path])
 
 
-def test_recordings_and_tables_of_two_kinds_are_searched_one_by_one(tmp_path: Path) -> None:
+def test_mixed_tables_and_recordings_are_rejected(tmp_path: Path) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
     (tmp_path / 'list.yaml').write_text('- hung.csv\n- recording: run.csv\n')
     (tmp_path / 'run.csv').write_text('t,x1\n')
@@ -205,7 +203,7 @@ def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: 
 
 
 @pytest.mark.parametrize('rest', ['0', ''])
-def test_one_dial_gauge_is_searched_whether_other_columns_are_zero_or_empty(tmp_path: Path, rest: str) -> None:
+def test_dial_gauge_is_searched_beside_empty_columns(tmp_path: Path, rest: str) -> None:
     """Readings that are exactly as simulated are no measurement; nothing is held against them."""
     masses = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
     rows = [f'{m},{rest},{min(-31.6e-3 * m, 0.0) if m < 1.4 else -31.6e-3 * 1.2:.6f},{rest}' for m in masses]

@@ -60,9 +60,7 @@ def recorded(path: Path, effects: Sequence[ActiveEffect], loads: bool = True) ->
 SOFT = make_active('bending_stiffness', {'scale': -0.05}, 'test')
 
 
-def test_a_reference_alone_names_what_the_link_lacks_though_loads_are_noted_late(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_reference_names_link_effect_with_late_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = recorded(tmp_path / 'camera.mcap', [SOFT])
     assert main(['discover', str(bag), '--out', str(tmp_path / 'found')]) == 0
     assert 'bending_stiffness' in capsys.readouterr().out

@@ -228,7 +228,7 @@ def test_a_refit_stops_at_a_bound_and_the_rest_adapts() -> None:
     assert refit(plant, [active('a', -1.0, 2e-3, x=0.9)], iterations=0).effects[0].values['x'] == 2e-3
 
 
-def test_a_model_that_is_not_exact_has_the_sd_of_its_scatter_over_load_cases() -> None:
+def test_inexact_model_has_sd_of_load_case_scatter() -> None:
     """Each fold has an effect of another size: the jackknife of least squares tells how sure it is."""
     shown = pictures(A)
     plant = Plant(shown, noise())
@@ -271,7 +271,7 @@ def test_four_recordings_are_left_out_one_by_one() -> None:
     assert plant.folds().tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_what_an_effect_weighs_is_the_chi_square_that_is_lost_without_it() -> None:
+def test_effect_weight_is_chi_square_lost_without_it() -> None:
     shown = pictures(A, ('b', 'x'), ('b', 'y'))
     shown['b', 'x'] += 0.5 * shown['a', 'x']
     plant = Plant(shown, 1e-4 * shown['a', 'x'] - 2e-4 * shown['b', 'x'] + noise())
@@ -364,7 +364,7 @@ def test_an_effect_whose_size_may_be_zero_is_not_named(
     assert bool(after.fit.effects) is named
 
 
-def test_where_the_size_of_none_is_no_number_what_is_lost_without_it_decides() -> None:
+def test_infinite_nominal_has_infinite_wald_value() -> None:
     endless = EffectParameter('x', 'V', -1.0, 1.0, 1e-3, '', nominal=math.inf)
     plant = Plant(pictures(A), noise())
     active = ActiveEffect(dataclasses.replace(effect('a', 'x'), parameters=(endless,)), {'x': 0.0})
@@ -396,7 +396,7 @@ def test_an_amplitude_at_its_bound_is_named_only_if_off_there() -> None:
         assert bool(fit.effects) == named
 
 
-def test_the_weakest_effect_goes_first_and_the_other_is_weighed_again() -> None:
+def test_weakest_effect_goes_first_then_reweighed() -> None:
     shown = pictures(A, B)
     # Two pictures nearly the same: with the other present, each seems to explain nothing.
     shown['b', 'x'] = shown['a', 'x'] + 0.1 * shown['b', 'x']
@@ -479,7 +479,7 @@ def test_weak_effects_are_dropped_before_alternatives(remains: float, kept: list
 # Load cases that a fit has not seen.
 
 
-def test_an_unseen_residual_is_that_of_a_fit_without_its_load_cases() -> None:
+def test_held_out_residual_is_of_fit_without_its_cases() -> None:
     shown = pictures(A, B)
     plant = Plant(shown, 1e-4 * shown[A] - 1e-4 * shown[B] + noise())
     fit = refit(plant, [active('a', x=0.0), active('b', x=0.0)])
@@ -682,7 +682,7 @@ def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bo
 
 
 @pytest.mark.slow
-def test_one_recording_of_a_thousand_has_a_larger_gap_from_noise_alone() -> None:
+def test_noise_exceeds_gap_limit_once_in_a_thousand() -> None:
     rng = np.random.default_rng(7)
     plant = Plant({}, noise())
     above = [plant.gap([SIGMA * rng.standard_normal((6, FINE))]) > plant.noise_limit() for _ in range(4000)]
@@ -719,7 +719,7 @@ def test_a_fit_in_a_side_valley_is_restarted(size: float, excess: float, open_le
     assert [a.values['f'] for a in after.fit.effects] == pytest.approx([found], abs=1.0)
 
 
-def test_a_dependence_is_the_chi_square_that_a_regressor_explains() -> None:
+def test_dependence_is_chi_square_of_regressor() -> None:
     history = loads.steps([(0, 0, 0), (5, -20, -9), (-10, 10, 12)], 0.6).loads
     volts = ForwardModel(RIG, []).expect(history, None).volts.T + noise(8)[0, 0]
     rng = np.random.default_rng(4)
@@ -790,7 +790,7 @@ def test_counts_gaps_and_floor_of_a_workspace() -> None:
 
 
 @pytest.mark.parametrize('share', [0.1, 0.3, 0.6])
-def test_the_noise_of_a_recording_with_gaps_is_that_of_the_whole_one(share: float) -> None:
+def test_noise_of_recording_with_gaps_equals_full_one(share: float) -> None:
     """Behind a slow movement of a hundred times the noise, which zeros in the gaps would take for noise."""
     rng = np.random.default_rng(5)
     volts = 2e-3 * rng.standard_normal((8000, 6))
@@ -806,7 +806,7 @@ def test_the_noise_of_a_recording_with_gaps_is_that_of_the_whole_one(share: floa
 # The experiment that decides.
 
 
-def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_experiment_separates_what_no_size_explains(monkeypatch: pytest.MonkeyPatch) -> None:
     """The least chi-square between two effects over the other's size, old and new data together; by a scan."""
     history = loads.steps([(0, 0, 0), (0, -50, -10)], 0.4)
     given = make_active('bending_stiffness', {'scale': -0.02, 'moves_frequency': 0}, 'test')

@@ -158,7 +158,7 @@ def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
 
 
 @pytest.mark.slow
-def test_the_zero_of_one_of_two_recordings_is_named_with_its_recording() -> None:
+def test_zero_of_second_recording_is_named_with_it() -> None:
     second = dataclasses.replace(recorded(seed=2), name='second')
     shift = np.array([0.3, -0.2, 0.0, 0.1, 0.4, 0.0])
     found = found_in(recorded(), changed(second, lambda volts: volts + shift))
@@ -184,7 +184,7 @@ def test_a_jump_is_found_at_its_sample() -> None:
 
 
 @pytest.mark.parametrize('share', [0.001, 0.05])
-def test_outliers_of_any_rate_and_size_are_left_out_and_movement_is_not(share: float) -> None:
+def test_outliers_are_excluded_and_movement_is_kept(share: float) -> None:
     o = recorded()
     rng = np.random.default_rng(3)
     bad = rng.random(o.volts.shape) < share
@@ -218,9 +218,7 @@ def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None =
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_lines_and_puts_them_into_the_model(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_prints_lines_and_puts_them_in_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Y of PSD 1 turned, and times of 800 samples a second against the 1000 of the rig file."""
     rig = replace_values(RIG, {'converter.sample_rate_hz': 800.0})
     counts = RigSimulator(rig, 0).step(HISTORY).counts

@@ -72,7 +72,7 @@ def test_white_noise_has_no_corner_that_matters() -> None:
     assert max(found) < 0.2
 
 
-def test_what_the_light_does_not_show_is_no_slow_noise_of_the_electronics() -> None:
+def test_slow_noise_without_light_is_not_electronic() -> None:
     rows = flicker(6000, PERIOD, 5.0, 1).T
     rows[[2, 5]] = np.random.default_rng(2).normal(size=(2, 6000))
     assert corners_of([rows], [PERIOD]).max() < 0.2
@@ -113,7 +113,7 @@ def test_whitening_is_its_own_adjoint_and_is_undone() -> None:
     np.testing.assert_allclose(slow.whiten(a)[0], a[0], rtol=1e-12)
 
 
-def test_a_cosine_is_weakened_by_the_root_of_the_density_at_its_frequency() -> None:
+def test_cosine_is_weakened_by_root_of_density() -> None:
     n, k = 500, 30
     f = 0.5 * k / (n * PERIOD)
     wave = np.cos(np.pi * k * (np.arange(n) + 0.5) / n) * np.ones((6, 1))
@@ -136,7 +136,7 @@ def model(corners: FloatArray) -> NoiseModel:
     return plain.with_slow_noise(corners, 1000, PERIOD, 0.02)
 
 
-def test_a_noise_model_whitens_by_both_and_leaves_what_is_not_there() -> None:
+def test_noise_model_whitens_by_both_and_keeps_gaps() -> None:
     slow = model(np.full(6, 3.0))
     assert slow.slow is not None
     assert slow.block_sigma == pytest.approx(0.5 * np.sqrt(block_factor(4.0, 0.02, np.full(6, 3.0))))
@@ -162,7 +162,7 @@ def test_corners_within_a_fifth_are_alike() -> None:
     assert model(np.zeros(6)).slow is None
 
 
-def test_a_workspace_has_the_slow_noise_of_its_recording_and_reports_it() -> None:
+def test_workspace_reports_slow_noise_of_recording() -> None:
     ws = Workspace([observed(5.0, 1)])
     (reported,) = ws.provenance()
     assert reported['corners_hz'] == ws.noise[0].corners.tolist()

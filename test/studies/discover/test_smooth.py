@@ -58,7 +58,7 @@ def smooth(plant: Table, variables: Mapping[str, Sequence[FloatArray]] | None = 
     return smooth_of(ws, fit, plant.variables() if variables is None else variables)
 
 
-def test_a_smooth_remainder_is_one_function_of_the_variable_that_it_follows() -> None:
+def test_smooth_remainder_is_function_of_its_variable() -> None:
     plant = Table(1, 1.0)
     found = psd_deflection.discover_in(plant)
     remainder = found.tree()['remainder']
@@ -140,7 +140,7 @@ def test_few_readings_report_no_function() -> None:
     assert smooth(Table(1, 1.0), {}) is None
 
 
-def test_sizes_that_channels_share_are_left_out_of_the_likelihood_once() -> None:
+def test_shared_sizes_leave_the_likelihood_once() -> None:
     """Up to a constant it is the density of what is left of the values across all that the effects can do."""
     rng = np.random.default_rng(5)
     channel = np.repeat([0, 1, 0, 1], [7, 5, 4, 6])

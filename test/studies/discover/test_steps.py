@@ -120,7 +120,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
 
 
-def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_reported(
+def test_effects_are_added_until_budget_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     names = 'abcdef'
@@ -156,7 +156,7 @@ def test_a_small_share_counts_beside_many_effects() -> None:
     assert 'beside 4 effects explains less than 20% of what remains' in few.limits[0].limit
 
 
-def test_an_effect_that_may_stand_in_is_not_added_and_that_is_reported() -> None:
+def test_stand_in_effect_is_reported_and_not_added() -> None:
     shown = pictures(A, B, C)
     # The library lacks c, which explains much more than b.
     plant = Plant(shown, without_noise((shown[A], 9e5), (shown[B], 4000.0), (shown[C], 60000.0)) + noise())
@@ -170,7 +170,7 @@ def test_an_effect_that_may_stand_in_is_not_added_and_that_is_reported() -> None
     assert (named(full.fit), full.limits) == (['a', 'b', 'c'], ())
 
 
-def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:
+def test_noise_beside_large_effect_hides_no_small_one() -> None:
     shown = pictures(A, B)
     shown[B] = across(shown[B], shown[A])
 
@@ -321,7 +321,7 @@ def amplitudes(*kinds: tuple[str, str, float], same: bool = False, finite: bool 
     return Fit(tuple(effects), 0.0, np.zeros(9), [], 1e3 * np.eye(9)[:, : len(kinds)], tuple(free), ())
 
 
-def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
+def test_only_like_sizes_of_two_effects_are_compared() -> None:
     physics = Physics.of(RIG)
     two = [('x', 'V', 0.5), ('y', 'V', 0.5)]
     ((tie),) = coincidences(amplitudes(*two), physics)
@@ -343,7 +343,7 @@ def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
     assert [len(t.members) for t in several] == [3, 2, 2, 2]
 
 
-def test_three_sizes_that_agree_a_little_are_tied_though_no_two_are() -> None:
+def test_three_sizes_are_tied_where_no_two_are() -> None:
     physics = Physics.of(RIG)
     two = [('x', '', 0.03), ('y', '', 0.0303)]
     assert coincidences(amplitudes(*two), physics)[0].odds < 40.0
@@ -366,7 +366,7 @@ def test_a_size_leaves_its_bound_for_however_little_it_gains(least: float, most:
         assert fit.at_bound == (() if inside > 0.0 else ((0, 'x'),))
 
 
-def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> None:
+def test_recording_of_few_samples_is_excluded_alone() -> None:
     full = make_observation(warm=None)
     volts = full.volts.copy()
     volts[60:] = np.nan

@@ -64,7 +64,7 @@ def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: floa
 
 
 @pytest.mark.slow
-def test_of_six_psds_a_wrong_wiring_and_an_effect_are_named_together() -> None:
+def test_wrong_wiring_and_effect_of_six_psds_are_named() -> None:
     found = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
     assert [(f.name, f.where) for f in found.setup] == [('channel_sign', 'x6')]
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 5)']
@@ -129,7 +129,7 @@ def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
     assert correct_wiring([read], ())[1:] == ([], {})
 
 
-def test_the_wirings_of_more_psds_are_those_with_two_wrong_ones_and_those_alike() -> None:
+def test_wirings_have_two_wrong_psds_or_all_alike() -> None:
     nominal = Wiring(axes=(('x', 'y'),) * 3)
     each = [wiring.axes[0] for wiring in WIRINGS[:64:8]]
     all_of_three = set(itertools.product(each, repeat=3))
@@ -158,7 +158,7 @@ def test_what_is_wired_otherwise_is_reported_of_any_psd() -> None:
 
 
 @pytest.mark.parametrize(('rig', 'count'), [(TWO, 1), (RIG, 3), (SIX, 9)])
-def test_what_no_movement_makes_is_as_many_numbers_as_there_are_readings_too_many(rig: Rig, count: int) -> None:
+def test_rows_across_movement_count_redundant_readings(rig: Rig, count: int) -> None:
     psds = len(rig.psds)
     rows = across_of(rig)
     assert rows.shape == (count, 2 * psds)
@@ -180,7 +180,7 @@ def test_what_no_movement_makes_is_as_many_numbers_as_there_are_readings_too_man
 
 
 @pytest.mark.parametrize('rig', [TWO, RIG, SIX])
-def test_the_readings_too_many_of_pure_noise_have_unit_covariance(rig: Rig) -> None:
+def test_redundant_readings_have_unit_covariance(rig: Rig) -> None:
     """Also if the noise of the detectors and their sensitivities differ."""
     other = {'psd_2.noise': [3e-3, 1e-3], 'psd_2.sensitivity': [1e-3, 2e-3], 'psd_1.sensitivity': [4e-4, 7e-4]}
     ws = Workspace([make_observation(replace_values(rig, other))])
@@ -211,7 +211,7 @@ def test_the_readings_too_many_of_pure_noise_have_unit_covariance(rig: Rig) -> N
         ('sensor_gain,psd=1,y=0.01', False),
     ],
 )
-def test_the_readings_too_many_acquit_the_detectors_of_what_the_link_does(word: str, acquitted: bool) -> None:
+def test_redundant_readings_acquit_detectors(word: str, acquitted: bool) -> None:
     ws = Workspace([make_observation(RIG, word)])
     residual, _ = ws.residual([])
     reading = fourth_reading(ws, residual)
@@ -230,7 +230,7 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
         discover(both[:1], TWO)
 
 
-def test_volts_of_another_number_of_psds_than_the_rig_has_are_rejected() -> None:
+def test_volts_of_wrong_number_of_psds_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
         Observation('x', SIX, make_observation(RIG).volts, LOADS)
 

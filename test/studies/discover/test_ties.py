@@ -29,7 +29,7 @@ def named(active: ActiveEffect, sd: float, *alternatives: Alternative) -> NamedE
     return NamedEffect(active, {amplitude: sd}, 1e-9, 50.0, HeldOut(9.0, 1.0), (), alternatives, (), None)
 
 
-def test_a_radius_the_material_or_the_loads_explain_both_stiffnesses() -> None:
+def test_radius_material_or_loads_explain_stiffnesses() -> None:
     (tie,) = ties([named(stiffness('bending', -0.04), 1e-4), named(stiffness('torsional', -0.0401), 1e-4)])
     assert tie.share == pytest.approx(-0.04005)
     radius, loads = tie.causes

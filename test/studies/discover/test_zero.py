@@ -47,7 +47,7 @@ def faultless() -> Discovery:
 
 
 @pytest.mark.slow
-def test_what_the_noise_of_a_taken_zero_leaves_is_nothing_unknown(faultless: Discovery) -> None:
+def test_residual_of_noisy_zero_is_nothing_unknown(faultless: Discovery) -> None:
     assert faultless.verdict == 'nothing_missing'
     assert not faultless.effects
     assert not faultless.unknown

@@ -53,7 +53,7 @@ def test_two_modes_that_beat_are_two() -> None:
 
 
 @pytest.mark.slow
-def test_noise_that_remembers_widens_the_interval_and_moves_nothing() -> None:
+def test_coloured_noise_widens_interval_without_bias() -> None:
     link = Link(((14.0, 0.02, 1.0),), noise=20e-6, memory=0.9)
     modes = [modes_of(rung(link, np.random.default_rng(seed)), RATE) for seed in range(2)]
     assert {m.how for m in modes} == {'ring-down'}

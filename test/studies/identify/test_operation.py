@@ -46,7 +46,7 @@ def lines(samples: FloatArray, frequency: float) -> tuple[FloatArray, FloatArray
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('prior', 'guess'), [(None, 14.0), (0.2, 14.5)])
-def test_it_is_the_likeliest_mode_with_the_scatter_of_its_likelihood(
+def test_mode_is_likeliest_with_scatter_of_likelihood(
     prior: float | None, guess: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The likelihood of exponential lines, in other parameters and by another search."""
@@ -104,7 +104,7 @@ def test_it_is_the_likeliest_mode_with_the_scatter_of_its_likelihood(
 @pytest.mark.parametrize(
     ('guess', 'observed'), [(14.0 / 0.72, True), (14.0 / 0.68, False), (10.15, True), (9.7, False)]
 )
-def test_a_mode_far_from_the_peak_is_not_the_one_that_was_asked_for(guess: float, observed: bool) -> None:
+def test_mode_far_from_peak_is_not_returned(guess: float, observed: bool) -> None:
     """Below 0.7 of it or above 1.4."""
     assert (mode_in_operation(driven(noise=3e-5), RATE, guess) is not None) is observed
 

@@ -176,7 +176,7 @@ def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     assert find_stretches(noise, noise, RATE, [(15.5, 0.01)], 1e-6) == ([], [(15.5, 0.01)])
 
 
-def test_a_mode_stays_if_it_saves_30_variances_and_4_each_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mode_stays_if_it_saves_30_plus_4_per_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
     t = times(800)
     rng = np.random.default_rng(9)
     both = [stretch(ring(t, size=s) + ring(t, 50.0, 0.01, 5e-6) + 1e-6 * rng.normal(size=800)) for s in (1e-3, -7e-4)]

@@ -99,7 +99,7 @@ def test_white_noise_below_a_link_that_is_driven_keeps_its_size(peaks: list[floa
     np.testing.assert_allclose(density, 2.0 * 2e-6**2 / RATE, rtol=0.12)
 
 
-def test_noise_that_remembers_has_the_density_of_its_autoregression() -> None:
+def test_coloured_noise_has_autoregressive_density() -> None:
     rng = np.random.default_rng(8)
     samples = sine(14.0) + lfilter([1e-6], [1.0, -0.9], rng.normal(size=20_000))
     f = np.array([60.0, 120.0, 300.0])
@@ -107,7 +107,7 @@ def test_noise_that_remembers_has_the_density_of_its_autoregression() -> None:
     np.testing.assert_allclose(coloured_noise(samples, RATE, [14.0]).density(f, RATE), expected, rtol=0.15)
 
 
-def test_above_a_fast_mode_there_is_too_little_to_report_what_remembers() -> None:
+def test_band_above_fast_mode_has_no_random_walk() -> None:
     """The whole spectrum then stands for the noise."""
     samples = np.random.default_rng(9).normal(0.0, 2e-6, 20_000)
     found = coloured_noise(samples, RATE, [185.0])

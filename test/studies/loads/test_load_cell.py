@@ -75,7 +75,7 @@ def test_loads_that_change_at_a_fiftieth_are_measured(changes: int, samples: int
 
 
 @pytest.mark.parametrize(('times', 'parts'), [(7.9, 1), (8.1, 2), (-7.9, 1), (-8.1, 2)])
-def test_a_step_is_a_change_by_more_than_eight_deviations_of_the_noise(times: float, parts: int) -> None:
+def test_load_step_is_above_eight_deviations_of_noise(times: float, parts: int) -> None:
     values = np.random.default_rng(5).normal(size=2001)
     steps = np.abs(np.diff(values))
     # The median of a normal law's absolute values is 0.6745 deviations; of a difference the deviation is root 2 larger.

@@ -36,7 +36,7 @@ def reported(dots: FloatArray) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('lost', 'share'), [(80, 0.98), (150, 0.5), (450, 0.02), (1500, 0.5)])
-def test_a_time_is_found_among_lost_samples_by_the_ringing_after_them(lost: int, share: float) -> None:
+def test_time_in_lost_samples_is_found_by_ringing(lost: int, share: float) -> None:
     dots = DOTS.copy()
     first = 2 * DWELL - round(share * lost)
     dots[first : first + lost] = np.nan

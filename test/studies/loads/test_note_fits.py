@@ -70,7 +70,7 @@ class Looked:
     ('start', 'took', 'middle'),
     [(3.0, 0.0, 3.0), (3.0, 0.0, 3.14), (3.0, 0.0, 2.86), (3.0, 0.2, 3.1), (3.0, 2.0, 4.0)],
 )
-def test_one_time_is_fitted_beside_drift_and_the_ringing_of_before(start: float, took: float, middle: float) -> None:
+def test_step_time_is_fitted_beside_drift_and_ringing(start: float, took: float, middle: float) -> None:
     step = steps_module.DotStep(
         1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200
     )
@@ -176,7 +176,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8400)) == [3.01]
 
 
-def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_cell_noise_is_removed_for_any_times(monkeypatch: pytest.MonkeyPatch) -> None:
     dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
     noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
     with_pieces(monkeypatch, [], {})

@@ -47,7 +47,7 @@ def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: CorrectedNo
     assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
 
 
-def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
+def test_ordinals_end_as_their_last_word() -> None:
     def ending(number: int) -> str:
         # eleventh, twelfth, thirteenth ... nineteenth
         teens = 10 < number % 100 < 20
@@ -144,7 +144,7 @@ def cheapest(
 
 
 @pytest.mark.parametrize('seed', range(40))
-def test_notes_and_steps_are_paired_at_the_least_cost_of_all_ways(seed: int) -> None:
+def test_notes_and_steps_are_paired_at_least_cost(seed: int) -> None:
     chance = np.random.default_rng(seed)
     changes = np.sort(chance.choice(6000, 5, replace=False))
     sizes = 1e-4 * np.exp(chance.normal(size=5))
@@ -168,7 +168,7 @@ def test_a_note_on_time_like_half_of_the_others_stays() -> None:
 # ---- loads between samples
 
 
-def test_a_step_between_samples_keeps_its_time_and_a_ramp_its_share() -> None:
+def test_step_keeps_its_time_and_ramp_its_share() -> None:
     t = np.arange(8.0)
     assert steps_module.applied(t, 3.0, 0.0, 1.0) == pytest.approx([0, 0, 0, 1, 1, 1, 1, 1])
     # A quarter after 3: three quarters of that sample, and 0.5 * 3/4 * 1/4 that the one before lacks.

@@ -95,18 +95,18 @@ def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, 
     [annotated((0.0,) * 6), annotated((0.3,) * 6), annotated((0.001, 0, 0.002, 0, 0.001, 0)), applied(1.2)],
     ids=['right', 'alike', 'a sample', 'a noted ramp'],
 )
-def test_right_times_and_one_small_delay_of_all_are_left_as_they_are(loads: FloatArray) -> None:
+def test_right_times_and_small_delay_are_unchanged(loads: FloatArray) -> None:
     assert corrected(QUIET, loads) is None
     assert corrected(ROTATED, loads) is None
 
 
-def test_other_natural_frequencies_than_the_rig_file_says_change_no_time() -> None:
+def test_other_natural_frequencies_change_no_time() -> None:
     read = volts(applied(), dynamics__bending_frequency=14.7, dynamics__torsion_frequency=20.4)
     assert corrected(read, annotated((0.0,) * 6)) is None
 
 
 @pytest.mark.slow
-def test_a_faultless_rig_whose_loads_were_noted_some_ms_off_lacks_nothing() -> None:
+def test_rig_with_jittered_load_times_lacks_nothing() -> None:
     observed = Observation('hung', RIG, QUIET, annotated(JITTER), None)
     found = discover([observed], RIG)
     assert found.verdict == 'nothing_missing'
@@ -133,7 +133,7 @@ def test_lost_samples_change_no_time() -> None:
     assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.003)
 
 
-def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
+def test_slow_load_annotated_as_step_is_a_ramp() -> None:
     found = corrected(volts(applied(0.8)), annotated((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
     assert found is not None
     assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
@@ -188,7 +188,7 @@ def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
 
 
 @pytest.mark.parametrize('moments', [0.0, 1.0, 2.0, 3.0, 4.0, 5.4, -1.0, -2.6])
-def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: float) -> None:
+def test_load_between_samples_moves_link_at_its_time(moments: float) -> None:
     frequency, ratio, first = 14.0, 0.02, 100
     loads = np.zeros((1000, 3))
     loads[first:, 1] = -50.0
@@ -207,7 +207,7 @@ def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: 
 
 
 @pytest.mark.slow
-def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
+def test_late_note_and_channels_read_after_one_another() -> None:
     read = volts(applied(), effects__e__name='channel_skew', effects__e__psd=2, effects__e__delay=2e-4)
     found = discover([Observation('x', RIG, read, annotated((0.0, 0.0, 3.4, 0.0, 0.0, 0.0)))])
     assert [e.active.label for e in found.effects] == ['channel_skew (psd 2)']
@@ -217,7 +217,7 @@ def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
     assert [(f.name, f.where) for f in found.setup] == [('load_time', 'load 3')]
 
 
-def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
+def test_load_from_second_sample_is_shifted_completely() -> None:
     loads = np.tile([0.0, -20.0, 0.0], (100, 1))
     loads[0] = 0.0
     note = CorrectedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)

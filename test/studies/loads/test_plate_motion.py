@@ -43,7 +43,7 @@ def test_plate_motion_needs_every_reading() -> None:
     assert moved_plate(RIG, volts, there) == pytest.approx(lost, abs=1e-12, nan_ok=True)
 
 
-def test_what_no_movement_of_the_plate_makes_is_what_least_squares_leave() -> None:
+def test_part_across_plate_is_least_squares_residual() -> None:
     dots = np.random.default_rng(1).normal(size=(4, 5))
     left = dots - PLATE @ np.linalg.lstsq(PLATE, dots, rcond=None)[0]
     (found,), (across,) = across_plate(RIG, as_volts(dots)), across_of(RIG)

@@ -36,9 +36,7 @@ WORDS = {
 @pytest.mark.parametrize(
     ('annotated', 'name', 'where'), [(TWICE, 'load_value', 'load 5'), (NEVER, 'missing_load', '8.000 s')]
 )
-def test_check_calibrate_and_discover_say_what_hung_in_the_same_words(
-    annotated: FloatArray, name: str, where: str
-) -> None:
+def test_check_calibrate_and_discover_name_load_alike(annotated: FloatArray, name: str, where: str) -> None:
     checked, run, log, found = answers(QUIET, annotated)
     assert [(f.name, f.where) for f in checked.findings] == [(name, where)]
     assert _rounded(checked.findings[0].fix) == WORDS[name]
@@ -128,7 +126,7 @@ def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
 
 
 @pytest.mark.slow
-def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> None:
+def test_unlike_load_may_be_sign_unit_or_effect() -> None:
     # The only loads along X: both other ways.
     both = annotated_as(4, (-30, 0, 0))
     both[5 * DWELL : 6 * DWELL] = (-40, -40, 20)
@@ -240,7 +238,7 @@ def observed(
     return PlateauLoads(listed, off, left * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
 
 
-def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:
+def test_load_size_is_plate_movement_at_0_1_m() -> None:
     found = observed({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
     assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
     assert found.annotated.tolist() == VARIED.tolist()
@@ -262,7 +260,7 @@ def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> 
         (8, {2: (0.0, 1.0, 0.0), 1: (0.0, -2.0, 0.0), 6: (0.0, 1.0, 0.0), 4: (1.0, 0.0, 0.0)}, ()),
     ],
 )
-def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
+def test_wrong_loads_need_five_right_ones_beside_them(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
     found = plateaus.outliers(observed(more, VARIED[:count]))
@@ -284,7 +282,7 @@ def test_a_faulty_detector_is_no_wrong_note() -> None:
         assert plateaus.outliers(observed(wrong, left=left), bent).gone == gone
 
 
-def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> None:
+def test_loads_are_free_if_explained_and_two_are_off() -> None:
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
     loads = np.repeat(VARIED, DWELL, axis=0)
     for left, free in ((0.19, True), (0.21, False)):
@@ -390,7 +388,7 @@ ONE_TORQUE = np.array(
 APPLIED_ONCE = np.array((20.0, -30.0, 17.5))
 
 
-def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
+def test_doubled_only_torque_is_the_outlier() -> None:
     more = APPLIED_ONCE - ONE_TORQUE[4]
     for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
         off = tuple((more + allowed).tolist())
@@ -404,7 +402,7 @@ def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
     assert plateaus.outliers(observed({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
 
 
-def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> None:
+def test_applied_load_is_single_change_of_doubled_note() -> None:
     more = APPLIED_ONCE - ONE_TORQUE[4] + (0.2, -0.01, 0.4)
     listed = observed({4: (float(more[0]), float(more[1]), float(more[2]))}, ONE_TORQUE)
     annotated = np.repeat(ONE_TORQUE, DWELL, axis=0)

@@ -62,7 +62,7 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
     np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], found.swung)
 
 
-def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
+def test_apparent_step_excludes_sway_from_its_start() -> None:
     asked, annotated = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, annotated_only=True)
     cut = 3 * DWELL + 1200
     pieces = [

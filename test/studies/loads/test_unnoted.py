@@ -61,7 +61,7 @@ def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
     assert found.verdict == 'effects_found'
 
 
-def test_loads_missing_in_the_middle_are_left_out_until_the_next_note() -> None:
+def test_missing_loads_are_excluded_until_next_note() -> None:
     annotated = HELD.copy()
     annotated[2 * DWELL : 10 * DWELL] = LEVELS[1]
     effective = effective_loads(RIG, VOLTS, annotated)
@@ -109,7 +109,7 @@ def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: floa
     )
 
 
-def test_a_change_counts_by_three_times_what_effects_may_do_to_the_load() -> None:
+def test_change_counts_above_three_times_allowed_effects() -> None:
     """That is 0.3 N and 1 % of the largest load, which is 20 N: 1.5 N in all."""
     (found,) = unannotated_times(asked([0.0, 1.6, 0.0, 1.6], alone=1), 20_000, 0.001)
     assert (found.first, found.last, found.changes) == (2000, 8000, 3)

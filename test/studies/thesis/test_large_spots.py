@@ -16,7 +16,7 @@ def test_while_the_weight_is_held_larger_dots_change_nothing() -> None:
         np.testing.assert_allclose(c.error[1], c.error[0], atol=1e-9)
 
 
-def test_only_the_overshoot_of_the_larger_weight_reaches_the_edge() -> None:
+def test_overshoot_of_larger_weight_alone_reaches_edge() -> None:
     """It goes to nearly twice the deflection, 3.8 mm in the mean of a block.
 
     The part of a dot of 2 mm that lies beyond 5 mm is not read.
@@ -29,7 +29,7 @@ def test_only_the_overshoot_of_the_larger_weight_reaches_the_edge() -> None:
 
 
 @pytest.mark.parametrize('force', FORCES)
-def test_the_error_of_least_squares_is_the_rotation_that_it_leaves_out(force: float) -> None:
+def test_least_squares_error_is_its_neglected_rotation(force: float) -> None:
     """theta dY less theta^2/2 of 100 mm, on dX; the iteration here has none."""
     truth = spot_run(force, DIAMETERS[0]).truth[-50:].mean(axis=0)
     (least_squares,) = (c for c in spot_changes() if (c.force, c.method) == (force, 'weighted least squares'))

@@ -65,7 +65,7 @@ def test_table_b1_at_full_precision(modulus: float, key: str) -> None:
         assert row == pytest.approx(golden, rel=1e-12)
 
 
-def test_every_cell_of_table_b1_agrees_or_is_an_erratum_with_its_reason() -> None:
+def test_table_b1_cells_agree_or_are_explained_errata() -> None:
     cells = table_b1()
     assert [(c.row, c.column) for c in cells] == [(str(n), column) for n in range(1, 7) for column in COLUMNS]
     assert {(int(c.row), c.column) for c in cells if not c.agrees} == set(ERRATA_B1)
@@ -101,7 +101,7 @@ def test_table_b2() -> None:
     assert round_as(cells[-1].computed, '1.68') == Decimal('1.64')
 
 
-def test_the_ratio_depends_on_the_links_lengths_unless_they_are_equal() -> None:
+def test_ratio_depends_on_link_lengths_unless_equal() -> None:
     # Conclusion 3 of the appendix holds only because L_CD = L_BC.
     aluminium = MATERIALS[0]
     one = torsion_to_bending_ratio(aluminium.youngs_modulus, aluminium.shear_modulus)

@@ -75,7 +75,7 @@ def test_printed_equations_are_wrong_by_what_the_audit_says(
     assert row.true == pytest.approx(true, rel=1e-4)
 
 
-def test_over_random_poses_corrections_hold_and_the_printed_root_never() -> None:
+def test_corrected_equations_hold_printed_root_never() -> None:
     rng = np.random.default_rng(5)
     sums_hold = 0
     for _ in range(300):

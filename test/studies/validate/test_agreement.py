@@ -53,7 +53,7 @@ def test_a_reference_that_moves_the_other_way_is_mirrored() -> None:
     assert not agreement(rng.normal(0.0, 1e-6, 3000), noise).mirrored
 
 
-def test_the_deviations_are_those_of_many_runs_of_noise_that_remembers() -> None:
+def test_deviations_match_many_runs_of_coloured_noise() -> None:
     rng = np.random.default_rng(4)
     true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 400))
     plain, half = [], []

@@ -29,7 +29,7 @@ def of(kept: FloatArray, seed: int = 0, period: float = PERIOD) -> Motion:
 
 
 @pytest.mark.parametrize(('exposure', 'half'), [(0.0, 8), (7.8, 12), (10.0, 13), (0.5, 9)])
-def test_each_instant_has_the_polynomial_through_the_samples_about_it(exposure: float, half: int) -> None:
+def test_instant_has_polynomial_through_nearby_samples(exposure: float, half: int) -> None:
     """``exposure`` in samples: eight samples on either side of it."""
     places = np.delete(np.arange(120.0), [40, 41, 44, 77])
     motion = of(places)

@@ -82,16 +82,14 @@ def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
         (replace(LATE, alternatives=(0.2,)), False, None),
     ],
 )
-def test_whether_the_offset_is_removed_is_reported_if_there_is_one(
-    offset: Offset, applied: bool, words: str | None
-) -> None:
+def test_offset_removal_is_reported_if_offset_exists(offset: Offset, applied: bool, words: str | None) -> None:
     message = replace(PLAIN, offset=offset, applied=applied).sentences()
     assert message[0] == offset.sentence
     assert len(message) == 4 + (words is not None)
     assert words is None or message[1] == words
 
 
-def test_cover_is_reported_if_the_reference_states_its_deviations() -> None:
+def test_coverage_is_reported_if_reference_has_sd() -> None:
     message = replace(PLAIN, covered=(0.95, 0.5, 1.0)).sentences()
     assert len(message) == 6
     assert message[-1] == (
