@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -144,6 +145,13 @@ def _exact() -> Any:
 
     class Exact(RoundTripRepresenter):
         def represent_scalar_float(self, data: Any) -> Any:
+            if data == 0.0 and math.copysign(1.0, data) < 0.0:
+                # ruamel.yaml cannot write -0e+00.
+                zero = ScalarFloat(0.0)
+                zero.__dict__.update(vars(data), _m_sign=False)
+                node = super().represent_scalar_float(zero)
+                node.value = f'-{node.value}'
+                return node
             node = super().represent_scalar_float(data)
             if float(node.value) != float(data):
                 digits = repr(float(data))

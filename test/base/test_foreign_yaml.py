@@ -160,6 +160,7 @@ def test_a_text_that_cannot_be_printed_is_no_parameter(value: str) -> None:
 @given(st.floats(-1e300, 1e300), st.integers(0, 17))
 @example(-1.629581928360124e-08, 0)
 @example(1e-08, 0)
+@example(-0.0, 0)
 def test_numbers_are_written_again_to_the_last_bit(value: float, digits: int) -> None:
     """As our reader reads them, in the notation of whoever wrote the file."""
     for text in (f'a: {value:.{digits}e}\n', yaml.safe_dump({'a': value}), yaml.safe_dump({'a': [value, 1.0]})):

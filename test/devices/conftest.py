@@ -62,10 +62,15 @@ class Served:
 
 
 class OwnClock:
-    """Stands for the module ``time``; nanoseconds that pass while somebody waits."""
+    """Stands for the module ``time``; nanoseconds that pass while somebody waits, in whichever thread."""
 
     def __init__(self) -> None:
         self.now = 10**12
+        self._advancing = threading.Lock()
+
+    def advance(self, ns: int) -> None:
+        with self._advancing:
+            self.now += ns
 
     def monotonic_ns(self) -> int:
         return self.now
@@ -77,7 +82,7 @@ class OwnClock:
         return self.now + 10**18
 
     def sleep(self, seconds: float) -> None:
-        self.now += round(seconds * 1e9)
+        self.advance(round(seconds * 1e9))
 
 
 class Wired:
@@ -120,7 +125,7 @@ class Wired:
             if self._waiting or self._clock.now >= deadline:
                 received, self._waiting = self._waiting, b''
                 return received
-            self._clock.now = min(self._clock.now + max(self.due_in_ns(), 1000), deadline)
+            self._clock.advance(min(max(self.due_in_ns(), 1000), deadline - self._clock.now))
 
     def write(self, frame: bytes) -> None:
         device = self._there()
@@ -222,7 +227,7 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
 
     def select(ports: Sequence[int], _: object, __: object, timeout: float) -> None:
         waits = [made[number].due_in_ns() for number in ports]
-        clock.now += min(max(min(waits), 1000), round(timeout * 1e9))
+        clock.advance(min(max(min(waits), 1000), round(timeout * 1e9)))
 
     for module in (thorlabs, dataq, text_lines):
         monkeypatch.setattr(module, 'time', clock)
