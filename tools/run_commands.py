@@ -126,7 +126,7 @@ HOURS = re.compile(r'^make mutants\b')
 """Campaigns whose shortest form says nothing: never run here."""
 
 FOREIGN = re.compile(r'^(python -m blind\.(foreign|duels)\b|make campaign NAME=duels\b)')
-"""Reads data of others, which are not in the repository: test_foreign.py and test_duels.py do, if they are there."""
+"""Reads data of others, which are not in the repository: test_duels.py does, if it is there."""
 
 NO_CAMPAIGNS = '--no-campaigns'
 
