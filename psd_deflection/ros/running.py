@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Iterator, Sequence
 
 import rclpy
@@ -18,6 +19,8 @@ from psd_deflection.run.signals import Signals
 
 SPIN_S = 0.1
 """Longest time until a signal takes effect, s."""
+WAKE_S = 0.2
+"""Longest wait for messages and timers if the system clock is set back, s."""
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
 OTHER_CHOICES = (TRANSPORTS, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 """With one of these the user has chosen the transports of Fast DDS."""
@@ -49,11 +52,24 @@ def ros(name: str, arguments: Sequence[str], shared_memory: bool = False) -> Ite
 
 @contextlib.contextmanager
 def executor_of(node: Node) -> Iterator[SingleThreadedExecutor]:
-    """An executor that serves ``node`` in the thread that spins it."""
+    """An executor that serves ``node`` in the thread that spins it.
+
+    Fast DDS waits until a time of the system clock: set back by an hour, a wait lasts as long. So a thread ends each.
+    """
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    ended = threading.Event()
+
+    def wake() -> None:
+        while not ended.wait(WAKE_S):
+            executor.wake()
+
+    waker = threading.Thread(target=wake, name='waker', daemon=True)
+    waker.start()
     try:
         yield executor
     finally:
+        ended.set()
+        waker.join()
         executor.remove_node(node)
         executor.shutdown(timeout_sec=0.2)

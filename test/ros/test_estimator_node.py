@@ -9,6 +9,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -397,6 +398,49 @@ def test_signals_end_it_and_leave_a_whole_recording(
     with Reader(folder) as bag:
         assert bag.message_count > 100
     assert not any('Traceback' in line for line in daemon.lines)
+
+
+STEPPED = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <stdlib.h>
+#include <time.h>
+#include <unistd.h>
+int clock_gettime(clockid_t clock, struct timespec *now) {
+  static int (*real)(clockid_t, struct timespec *);
+  if (!real) real = dlsym(RTLD_NEXT, "clock_gettime");
+  int status = real(clock, now);
+  if (clock == CLOCK_REALTIME && access(getenv("STEP_FILE"), F_OK) == 0) now->tv_sec += atol(getenv("STEP_S"));
+  return status;
+}
+"""
+"""Preloaded, it sets the system clock of one process by STEP_S as soon as STEP_FILE exists."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which('cc') is None or sys.platform != 'linux', reason='a C compiler and LD_PRELOAD')
+@pytest.mark.parametrize('step_s', [3600, -3600])
+def test_a_signal_ends_it_after_a_step_of_the_system_clock(
+    start: Callable[..., Any], peer: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: int
+) -> None:
+    library, flag = tmp_path / 'stepped.so', tmp_path / 'step'
+    build = ['cc', '-shared', '-fPIC', '-x', 'c', '-', '-o', str(library), '-ldl']
+    subprocess.run(build, input=STEPPED, text=True, check=True)
+    with monkeypatch.context() as preloaded:
+        for name, value in {'LD_PRELOAD': library, 'STEP_FILE': flag, 'STEP_S': step_s}.items():
+            preloaded.setenv(name, str(value))
+        daemon = start('--record', str(tmp_path))
+    reports = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.until(lambda: len(reports) > 1, 'reports')
+    flag.touch()
+    said = f'the system clock was set by {"+3600." if step_s > 0 else "-3"}'
+    peer.until(lambda: any(s.message.startswith(said) for r in reports for s in r.status), 'the step')
+    began = time.monotonic()
+    daemon.send(signal.SIGINT)
+    assert daemon.wait() == 0, daemon.lines
+    assert time.monotonic() - began < 8.0
+    (folder,) = tmp_path.glob('psd_*')
+    assert main(['replay', str(folder), '--compare']) == 0
 
 
 def test_what_cannot_run_says_why_in_one_line(domain: int, capfd: pytest.CaptureFixture[str]) -> None:
