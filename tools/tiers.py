@@ -68,7 +68,7 @@ ROOMS: Mapping[str, Room] = {
             _PIPELINE,
             'test/measure/test_estimation.py',
             'test/measure/test_correction.py',
-            'test/model/misalignment/test_spread.py',
+            'test/model/misalignment/test_parameter_covariance.py',
             'test/measure/uncertainty/test_pipeline_state.py',
             'test/measure/test_health.py',
             'test/measure/test_state.py',
@@ -156,12 +156,12 @@ ROOMS: Mapping[str, Room] = {
             'test/studies/discover/test_discover.py',
             'test/studies/discover/test_planning.py',
             'test/studies/discover/test_setup.py',
-            'test/studies/discover/test_hung.py',
+            'test/studies/discover/test_applied.py',
         ),
         leave=('psd_deflection/studies/discover/report.py',),
         slow=tuple(
             f'test/studies/discover/test_{n}.py'
-            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings', 'hung')
+            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings', 'applied')
         ),
     ),
     'link': Room(
@@ -218,8 +218,8 @@ ROOMS: Mapping[str, Room] = {
             'test/studies/loads',
         ),
         slow=(
-            *('test/run/test_guided.py', 'test/run/test_last_step.py'),
-            *(f'test/studies/discover/test_{n}.py' for n in ('setup', 'hung')),
+            *('test/run/test_guided.py', 'test/run/test_last_load_change.py'),
+            *(f'test/studies/discover/test_{n}.py' for n in ('setup', 'applied')),
         ),
     ),
     'identify': Room(
@@ -270,7 +270,7 @@ ROOMS: Mapping[str, Room] = {
             'psd_deflection/run/monitor/kept_history.py',
         ),
         (
-            'test/run/test_last_step.py',
+            'test/run/test_last_load_change.py',
             'test/run/monitor/test_history.py',
             'test/run/monitor/test_kept_history.py',
         ),
