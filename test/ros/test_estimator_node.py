@@ -433,8 +433,8 @@ def test_a_signal_ends_it_after_a_step_of_the_system_clock(
     reports = peer.collect(DiagnosticArray, '/diagnostics')
     peer.until(lambda: len(reports) > 1, 'reports')
     flag.touch()
-    said = f'the system clock was set by {"+3600." if step_s > 0 else "-3"}'
-    peer.until(lambda: any(s.message.startswith(said) for r in reports for s in r.status), 'the step')
+    stated = f'the system clock was set by {"+3600." if step_s > 0 else "-3"}'
+    peer.until(lambda: any(s.message.startswith(stated) for r in reports for s in r.status), 'the step')
     began = time.monotonic()
     daemon.send(signal.SIGINT)
     assert daemon.wait() == 0, daemon.lines

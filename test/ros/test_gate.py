@@ -129,7 +129,7 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
     peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
 
 
-def test_a_publisher_that_keeps_nothing_is_offered_no_latched_subscription(
+def test_a_volatile_publisher_gets_no_latched_subscription(
     peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """DDS would warn it of messages that do not come, while they do. One that keeps its message is heard, however late
