@@ -62,6 +62,7 @@ BOUNDED_BY = {
     'measure/watch.py:_learned': 'LEARN',
     'measure/watch.py:_since': 'REMEMBER',
     'run/reading/pinger.py:_under_way': 'MOST_UNDER_WAY',
+    'ros/gate.py:_latched': 'the latched inputs of a node',
     'ros/camera.py:_since': 'one second',
     'ros/chain.py:_inputs': 'the links of the chain',
     'ros/follow.py:_goals': 'MOST_WAITING, and MOST_GOALS a second that end within ANSWER_S of being replaced',
