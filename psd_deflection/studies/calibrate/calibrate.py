@@ -56,18 +56,22 @@ from psd_deflection.studies.calibrate.observation import (
 OPEN = 0.9
 """A standard deviation above this share of the tolerance: undetermined."""
 SPOILT = 1.1
-"""How much the standard deviation of another parameter may grow when one is held at its tolerance."""
+"""Largest factor by which holding one parameter may raise the standard deviation of another."""
 CONTRADICTED = 3.5
-"""Standard deviations of the prior beyond which a determined parameter says that its tolerance was too small."""
+"""A determined parameter that is further off than this, in standard deviations of the prior, had too small a
+tolerance.
+"""
 WIDER = 10.0
 WORSE = 1.01
-"""Ratio of the gaps on unseen motion above which a calibration is rejected; less is chance."""
+"""A calibration is rejected if its gap on unseen motion exceeds the rig file's by this factor, or if its weighted
+misfit there is larger at all.
+"""
 FOLDS = 8
-"""Pieces of a recording, every second of which is held out in turn."""
+"""Pieces of a recording; the even ones are predicted by a fit of the odd ones, and the other way round."""
 OFTEN = 300
-"""Rows used to find the clock's offset roughly."""
+"""Number of the fastest rows, from which the clock's offset is found roughly."""
 CLOCK_RANGE, CLOCK_STEP = 0.060, 0.004
-"""s, within which the offset of the reference's clock is looked for, and in what steps."""
+"""The offset of the reference's clock is searched within ± the first, in steps of the second, s."""
 
 
 class Direction(NamedTuple):
@@ -78,7 +82,11 @@ class Direction(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """rms of reading minus model, m: of all rows, and of rows that were not fitted."""
+    """rms of reading minus model, m (``self``: along the redundant direction).
+
+    ``before``, ``heldout_before``: by the rig file. ``after``: by the fit. ``heldout_after``: each half of the rows by
+    the fit of the other half.
+    """
 
     before: float
     after: float
@@ -90,9 +98,10 @@ class Gap(NamedTuple):
 class Calibration:
     """The answer. ``values``, ``sd`` by name of ``NAMES``; ``covariance`` (SIZE, SIZE).
 
-    ``vector``, ``prior``: what the rig file says. ``noise`` (4,): of a sample of each reading, V rms. ``clock``: the
-    offset of the reference's clock, s, to be added to its times. ``rejected``: why the rig file was left as it is, or
-    ''. ``widened``: parameters whose tolerance the recordings contradict. ``dropped``: terms that unseen motion
+    ``vector``: what the rig file says. ``prior``: the same, with the tolerances that the recordings contradict widened.
+    ``noise`` (4,): of a sample of each reading, V rms. ``clock``: the rough offset of the reference's clock, s, which
+    the rows have already; the full one is ``clock + values[CLOCK]``. ``rejected``: why the rig file was left as it is,
+    or ''. ``widened``: parameters whose tolerance the recordings contradict. ``dropped``: terms that unseen motion
     rejected. ``rows``, ``fit``: for pictures. ``dark``: what was measured with the lasers off; ``rig`` has it already.
     """
 
@@ -129,7 +138,7 @@ class Calibration:
 
     @property
     def used(self) -> FloatArray:
-        """Parameters (SIZE,) as the pipeline took them before."""
+        """Parameters (SIZE,) as the pipeline took them before the calibration."""
         return before_of(self.vector, self.prior)
 
     @property
@@ -248,7 +257,7 @@ def coarse_delay(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) ->
         dots = usable_dots(run, rig)
         period = float(np.median(np.diff(run.t)))
         linear = linearised(moving, prior_of_rig(rig).mean, rig, 'reference')
-        # What does not depend on the clock is taken off as a mean: the fit has not begun.
+        # The median is subtracted: it holds what does not depend on the clock, as nothing has been fitted yet.
         for i, delay in enumerate(lates):
             places = np.interp(moving.t + delay, run.t, np.arange(len(run.t)))
             s = smoothed(dots, period, places)
@@ -258,14 +267,14 @@ def coarse_delay(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) ->
                 costs[i] += float(np.abs(off - np.median(off, axis=0)).mean())
     best = int(np.argmin(costs))
     middle = len(costs) // 2
-    # Only if it shows: what no motion tells is noise.
+    # Only a clear minimum counts: without motion the costs differ by noise alone.
     return float(lates[best]) if costs[best] < 0.9 * costs[middle] else 0.0
 
 
 def believed_fit(
     first: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask
 ) -> tuple[CalibrationFit, Prior, list[str]]:
-    """Widen what the rows contradict, the worst at a time, each once; the third are the names of these."""
+    """Widen the prior of parameters that the rows contradict, the worst first, each once; the last are their names."""
     widened: list[int] = []
     while len(widened) < 6:
         sd = np.sqrt(np.diag(first.covariance))
@@ -286,8 +295,8 @@ def believed_fit(
 def _determined(first: CalibrationFit, prior: Prior, free: Mask) -> Mask:
     """Which parameters are fitted; the others are held at the file's values, the least known first.
 
-    One is held only if the rest then knows hardly less: of parameters that the rows tie together, such as a turn and a
-    crosstalk, none can be held at its tolerance without spoiling the others.
+    One is held only if no other standard deviation grows by more than ``SPOILT``: of parameters that the rows determine
+    only together, such as a rotation and a crosstalk, none can be held without spoiling the others.
     """
     every = np.sqrt(np.diag(posterior(first.information, prior, free)))
     ratio = np.where(free, every / prior.sd, 0.0)
@@ -350,7 +359,9 @@ def _heldout(
 def _without_rejected_terms(
     full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind
 ) -> tuple[CalibrationFit, Prior, list[str]]:
-    """Drop a non-linearity that unseen motion contradicts: the file's value stays, within what the rows leave open."""
+    """Hold a non-linearity at the file's value if fitting it predicts unseen motion worse; narrow its prior all the
+    same.
+    """
     dropped: list[str] = []
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
         i = INDEX[name]
@@ -366,7 +377,7 @@ def _without_rejected_terms(
         more = costs[0] - costs[1]
         if more.sum() > 2.0 * float(np.sqrt(np.sum(more**2))):
             dropped.append(name)
-            # The rows bound it all the same: by what they gave it and left open.
+            # Its new variance is the fitted variance plus the squared distance from the file's value.
             away = full_fit.covariance[i, i] + (full_fit.values[i] - prior.mean[i]) ** 2
             covariance = prior.covariance.copy()
             shrunk = min(1.0, float(away / covariance[i, i]) ** 0.5)
@@ -378,9 +389,9 @@ def _without_rejected_terms(
 
 
 def with_clamp(full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
-    """Return the clamp's compliances from the reference's poses at rest under known loads, if there are any.
+    """Return the fit with the clamp's compliances added, from the reference's poses at rest under known loads, if any.
 
-    The link's own stiffness is taken as the rig file has it: at one length a clamp that gives way is a softer link.
+    The link's stiffness is that of the rig file: at one length a soft clamp cannot be distinguished from a soft link.
     """
     rest = rows.rest & (full_fit.weights > 0.0)
     values, covariance, free = full_fit.values.copy(), full_fit.covariance.copy(), full_fit.free.copy()
@@ -425,7 +436,7 @@ _NEEDS = {
     'zero': 'the unloaded link, with its reference',
 }
 MOTIONS = tuple(dict.fromkeys(_NEEDS.values()))
-"""What determines parameters, what is easily done first."""
+"""What determines parameters, the easiest first."""
 ROTATED = (
     'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
 )
@@ -442,7 +453,7 @@ def needs_of(names: Sequence[str]) -> str:
 
 def undetermined(full_fit: CalibrationFit, prior: Prior) -> list[Direction]:
     """Directions whose spread stays above ``OPEN`` of the tolerances: single parameters, then combinations."""
-    # The zero is measured at every start, and the clock is no parameter of the rig.
+    # The zero is reported apart, and the clock is no parameter of the rig.
     reported = np.array([not ZERO <= i < COUNT and i != CLOCK for i in range(SIZE)])
     open_still = np.sqrt(np.diag(full_fit.covariance)) > OPEN * prior.sd
     held = np.flatnonzero(~full_fit.free & reported & open_still)
@@ -454,7 +465,7 @@ def undetermined(full_fit: CalibrationFit, prior: Prior) -> list[Direction]:
         return out
     block = np.ix_(at, at)
     sd = prior.sd[at]
-    # Against the prior of these alone, which may be correlated (an earlier calibration).
+    # In units of the prior's standard deviations; its correlations (of an earlier calibration) are in the posterior.
     size, vectors = np.linalg.eigh(posterior(full_fit.information, prior, full_fit.free)[block] / np.outer(sd, sd))
     open_ones = vectors[:, size > OPEN**2]
     for parts in _sparse(open_ones):

@@ -2,20 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters and their covariance from rows of readings and poses: Gauss-Newton with the tolerances as a prior.
 
-The reference y of row j is the pose with an error e (errors in variables). With the pose x_j that the readings m_j
-give, which is far more precise, and the derivatives taken there,
+The reference y of row j is the pose with an error e (errors in variables). With the pose x_j computed from the readings
+m_j, which is far more precise than y_j, and the derivatives taken there,
 
     r_j = m_j - f(x_j; p) - J_y (y_j - v_j tau - x_j) = J_p dp + n_j - J_y e_j,    C_j = J_y S_ref J_y^T + S_dots.
 
-The pose drops out, and generalised least squares with C_j is the joint answer for parameters and poses. Derivatives at
-y_j would go with its errors and pull the gains towards zero (attenuation). J_y is (4, 3): along the direction that it
-does not reach, the one redundant reading, the reference's noise does not enter, and the weight is that of the
-detectors. Known loads take the place of y, with the link's compliance; without either S_ref is as good as infinite.
+J_p, J_y: derivatives of f by parameters and by pose; n_j: noise of the dots, covariance S_dots; v_j: velocity of the
+pose. The pose drops out, and generalised least squares with C_j is the joint answer for parameters and poses.
+Derivatives at y_j would be correlated with its errors and bias the gains towards zero (attenuation). J_y is (4, 3):
+along the direction that it does not reach, the one redundant reading, the reference's noise does not enter, and the
+weight is that of the detectors. Known loads take the place of y, with the link's compliance; without either S_ref is as
+good as infinite.
 
-tau is the offset of the reference's clock. S_ref (three variances, in proportion to those that the reference states for
-each row, if it does) and a factor on S_dots are variance components:
-estimated from the residuals, in turn with p. Rows beyond ``FAR`` are outliers and count for nothing. A reference whose
-errors are correlated from row to row counts as the fewer rows that it is worth.
+tau is the offset of the reference's clock. S_ref (three variances, multiplied row by row by those that
+the reference states, if it does) and a factor on S_dots are variance components, estimated from the residuals in
+alternation with p. Rows beyond ``FAR`` are outliers and count for nothing. If the reference's errors are correlated
+from row to row, its rows are weighted as the smaller number of independent ones.
 """
 
 from __future__ import annotations
@@ -48,9 +50,9 @@ FAR = 27.0
 """Squared distance of an outlier, of four residuals: one good row in 50 000."""
 STEPS, PASSES = 4, 4
 ZERO_PASSES, SAME_ZERO = 4, 1e-8
-"""Fits after each of which the zeros of the recordings are taken anew, unless they change by less than that, m."""
+"""Most repetitions of estimating the recordings' zeros and fitting again; the change of a zero, m, that ends them."""
 _FREE = 1.0
-"""Standard deviation, m and rad, of a pose that nothing but the dots tells."""
+"""Standard deviation, m and rad, of a pose that only the dots determine."""
 _HUBER = 3.0
 
 
@@ -72,7 +74,7 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
     vector = vector_of_rig(rig) if vector is None else vector
     covariance = np.zeros((SIZE, SIZE))
     covariance[:COUNT, :COUNT] = known_of_rig(rig).covariance
-    # The beams may stand elsewhere today: a zero is taken anew for every session.
+    # The beams may have moved since: the file's zero counts only to within the default tolerance.
     covariance[ZERO:COUNT] = covariance[:, ZERO:COUNT] = 0.0
     covariance[ZERO:COUNT, ZERO:COUNT] = np.diag(TOLERANCES[ZERO:] ** 2)
     stated = stated_sd(rig)
@@ -90,7 +92,7 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
 class Noise:
     """``reference`` (3,): median standard deviations of the reference, m, m, rad. ``dots``: factor on the dots' noise.
 
-    ``fewer``: rows that are worth one, because the reference's errors are correlated.
+    ``fewer``: rows that carry the information of one independent row, because the reference's errors are correlated.
     """
 
     reference: FloatArray
@@ -154,10 +156,10 @@ def linearised(rows: Rows, z: FloatArray, rig: Rig, kind: Kind) -> Linear:
 
 
 def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, length: float) -> FloatArray:
-    """Poses (n, 3) that fit the readings (n, 4) best; each reading weighs as its ``variances`` (n, 4), m^2, say.
+    """Poses (n, 3) that fit the readings (n, 4) best by least squares, weighted by their ``variances`` (n, 4), m^2.
 
-    With other weights the pose's errors and those of the redundant residual would be correlated, and with the
-    derivatives at the pose the gains would be drawn off.
+    Other weights would correlate the pose's errors with those of the redundant residual; with the derivatives taken at
+    the pose, the gains would be biased.
     """
     root = 1.0 / np.sqrt(variances)
 
@@ -259,7 +261,9 @@ def explained(
 
 
 def refitted(full_fit: CalibrationFit, rows: Rows, prior: Prior, row_weights: FloatArray, free: Mask) -> FloatArray:
-    """Return the parameters (SIZE,) of the rows with ``row_weights`` (n,) 1, not 0, by one step from the full fit."""
+    """Return the parameters (SIZE,) fitted to the rows whose ``row_weights`` (n,) are 1, by one step from the full
+    fit.
+    """
     inverse = weight_matrices(full_fit.linear, rows, full_fit.noise)
     z = full_fit.values.copy()
     z[~free] = prior.mean[~free]
@@ -426,7 +430,7 @@ def deviation_of(values: FloatArray, robustly: bool) -> float:
 
 
 def fewer(errors: FloatArray, run: np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:
-    """Rows that are worth one if ``errors`` (n, k) follow on each other like an autoregression of the first order.
+    """Rows that carry the information of one independent row if ``errors`` (n, k) are a first-order autoregression.
 
     ``run`` (n,): which recording each row is of.
     """
