@@ -1,10 +1,10 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a recording that a crash cut: index and summary for each file, ``metadata.yaml`` for the bag.
+"""Repairs a recording that ends in a crash: index and summary for each file, ``metadata.yaml`` for the bag.
 
-Every intact record of a file is copied, byte for byte, into a new file beside it. Only then is the old file
-renamed to ``NAME.mcap.cut`` and the new one takes its name, so a failed repair loses nothing. Files that
-have their end are not touched.
+Every intact message of a file is copied into a new file beside it, its bytes unchanged; chunks and indexes are made
+anew. Only then is the old file renamed to ``NAME.mcap.cut`` and the new one takes its name, so a failed repair loses
+nothing. Complete files are not touched.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Recovered:
 
 
 def _qos_of(metadata: Mapping[str, str]) -> Qos | list[Qos]:
-    """The QoS profile of a channel, so that ``metadata.yaml`` and the channel agree."""
+    """The QoS profiles of a channel: the default if it names none, an empty list if they cannot be read."""
     text = metadata.get('offered_qos_profiles', '')
     if not text or len(text) > _MAX_QOS_TEXT:
         return DEFAULT_QOS if not text else []
@@ -76,7 +76,6 @@ class _Copy:
 
     def __init__(self, target: Path | None) -> None:
         self.topics: dict[str, TopicCount] = {}
-        self.times: list[int] = []
         self._stream = target.open('xb') if target is not None else None
         self._spool: BinaryIO | None = None
         self._writer: McapWriter | None = None
@@ -167,13 +166,22 @@ def _recover_file(path: Path) -> RecoveredFile:
         raise
     count = FileCount(path.name, copy.start, copy.end, copy.messages)
     if cut:
-        aside = path.with_name(path.name + '.cut')
-        if aside.exists():
+        try:
+            _set_aside(path)
+        except RecordingError:
             partial.unlink()
-            raise RecordingError(f'{aside}: is there already, from an earlier repair; move it away first')
-        path.rename(aside)
+            raise
         partial.rename(path)
     return RecoveredFile(path, cut, count, list(copy.topics.values()), source.warnings)
+
+
+def _set_aside(path: Path) -> Path:
+    """Rename ``path`` to ``PATH.cut`` and return that; raises RecordingError if an earlier repair left a file there."""
+    aside = path.with_name(path.name + '.cut')
+    if aside.exists():
+        raise RecordingError(f'{aside}: exists already, from an earlier repair; move it away first')
+    path.rename(aside)
+    return aside
 
 
 def _reject_if_written(path: Path) -> None:
@@ -186,7 +194,7 @@ def recover(path: str | Path) -> Recovered:
     """Repair ``path``, a bag folder or a single ``.mcap``, in place.
 
     Raises RecordingError if nothing in it can be read, if it is still being recorded, or if the
-    disk rejects to write.
+    disk cannot be written.
     """
     path = Path(path)
     try:
@@ -222,11 +230,9 @@ def _recover_folder(folder: Path) -> Recovered:
         _reject_if_written(file)
     files, set_aside = [], []
     for file in paths:
-        # A file without its first bytes holds nothing.
+        # A file with no more than its first bytes holds nothing. The only file of a bag stays, even so.
         if file.stat().st_size <= len(MAGIC) and len(paths) > 1:
-            aside = file.with_name(file.name + '.cut')
-            file.rename(aside)
-            set_aside.append(aside)
+            set_aside.append(_set_aside(file))
             continue
         files.append(_recover_file(file))
     metadata = folder / 'metadata.yaml'

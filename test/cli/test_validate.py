@@ -46,7 +46,7 @@ def test_the_offset_is_reported_and_removed_if_asked(run: Path, late: Path, caps
     found = json.loads(capsys.readouterr().out)
     # The blocks' stamps lie in the middle of 20 samples; the row of the reference is the next one, half a sample on.
     assert found['offset']['value'] == pytest.approx(-0.0125, abs=0.6e-3)
-    assert found['offset']['told']
+    assert found['offset']['determined']
     assert not found['offset']['applied']
     assert found['rejected'] == {'blurred': 1}
     without = found['solvers']['exact']['dy']['rms']

@@ -158,14 +158,15 @@ def test_recover_rejects_a_running_recording(tmp_path: Path) -> None:
     bag.close()
 
 
-def test_an_earlier_repair_is_not_overwritten(tmp_path: Path) -> None:
-    folder = record(tmp_path / 'run')
-    cut(folder, 'run_0.mcap', 20_000)
-    (folder / 'run_0.mcap.cut').write_text('precious')
-    with pytest.raises(RecordingError, match=r'run_0\.mcap\.cut: is there already'):
+@pytest.mark.parametrize('kept', [20_000, 3])
+def test_an_earlier_repair_is_not_overwritten(tmp_path: Path, kept: int) -> None:
+    folder = record(tmp_path / 'run', max_s=2.5)
+    cut(folder, 'run_1.mcap', kept)
+    (folder / 'run_1.mcap.cut').write_text('precious')
+    with pytest.raises(RecordingError, match=r'run_1\.mcap\.cut: exists already'):
         recover(folder)
-    assert (folder / 'run_0.mcap.cut').read_text() == 'precious'
-    assert (folder / 'run_0.mcap').stat().st_size == 20_000
+    assert (folder / 'run_1.mcap.cut').read_text() == 'precious'
+    assert (folder / 'run_1.mcap').stat().st_size == kept
 
 
 @pytest.mark.parametrize(('content', 'message'), [(b'no mcap at all', 'not an MCAP'), (None, 'no such recording')])

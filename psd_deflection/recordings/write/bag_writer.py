@@ -42,13 +42,14 @@ from psd_deflection.records import ParameterChange, Record, RigState
 from psd_deflection.rig.declarations import FRAME_PREFIX
 
 CHUNK_NS = 500_000_000
-"""Largest log time that a chunk spans: together with the queues, a crash costs less than a second.
-"""
+"""A chunk spans less than this log time, ns: a crash costs it and what waits in the recorder's queue."""
 
 META_SOFTWARE = 'psd_deflection'
 META_NODE = 'node'
 META_DROPPED = 'psd_deflection.dropped_here'
-"""Names of the MCAP metadata records, which say who recorded and what is missing, and of a value in the first."""
+"""``META_SOFTWARE`` and ``META_DROPPED`` name MCAP metadata records: what recorded the file, and what it lacks.
+``META_NODE`` is a key in the first.
+"""
 
 CUSTOM = {'psd_deflection_version': __version__}
 
@@ -69,7 +70,10 @@ class _RecordSink(abc.ABC):
     def write_encoded(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None: ...
 
     def put(self, record: Record) -> None:
-        """Write all messages of one record; the log time is the record's own stamp."""
+        """Write all messages of one record, at the record's own stamp.
+
+        A ParameterChange waits for the next message, and gets its time.
+        """
         if isinstance(record, ParameterChange):
             self._change(record)
             return
@@ -86,7 +90,7 @@ class _RecordSink(abc.ABC):
 class McapFile(_RecordSink):
     """One MCAP file being written; common to bags and single files.
 
-    ``write`` takes the records of one thread. Raises RecordingError if the file exists, cannot be
+    Call it from one thread at a time. Raises RecordingError if the file exists, cannot be
     created, or the disk cannot be written. After such an error the file is closed and holds all
     complete chunks. While it is being written the file is locked (``flock``), so that no program
     repairs it. ``durable``: each chunk is written to the disk, not only to the operating system,
@@ -195,7 +199,7 @@ class McapFile(_RecordSink):
         return RigState(t_ns, block, dict(self._present), self._hello, changed, __version__, provenance())
 
     def _notify_rig(self, t_ns: int) -> None:
-        """The rig as messages: what rosbag2 makes of a bag keeps them, and no metadata."""
+        """Write the rig as messages too: a bag that rosbag2 converts keeps its messages and loses the MCAP metadata."""
         untold, self._untold = self._untold, []
         for state in untold:
             for message in to_messages(state):
@@ -213,7 +217,7 @@ class McapFile(_RecordSink):
     def _write(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         if self._stream is None:
             raise self._closed()
-        # As _guard, which costs as much as the rest.
+        # Written out instead of _guard, which would cost as much as the rest.
         try:
             channel = self._channels.get(topic)
             if channel is None:
@@ -326,7 +330,7 @@ class BagWriter(_RecordSink):
 
     @property
     def in_place(self) -> bool:
-        """Whether the path of the file that is written still leads to it: neither it nor the folder was moved."""
+        """Whether the file being written is still found at its path: neither it nor the folder was moved."""
         return self._held.in_place() and self._file.within(self._held)
 
     def _begin(self) -> McapFile:
@@ -353,7 +357,7 @@ class BagWriter(_RecordSink):
         self._file.write_encoded(topic, type_name, message, t_ns)
 
     def rotate(self) -> None:
-        """Close the file and begin the next, which repeats the changes so far."""
+        """Close the file and begin the next, which repeats all parameter changes so far."""
         before = self._file
         before.close()
         self._ended.append((before.count(), list(before.topics.values())))
@@ -378,7 +382,7 @@ class BagWriter(_RecordSink):
         self._file.flush()
 
     def note_dropped(self, samples: int, messages: int) -> None:
-        """As of :class:`McapFile`, for the whole bag."""
+        """Note what the bag lacks, in the file being written and in ``metadata.yaml``; call it just before the end."""
         self._file.note_dropped(samples, messages)
 
     def information(self) -> dict[str, Any]:
@@ -390,9 +394,9 @@ class BagWriter(_RecordSink):
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; a second call does nothing.
 
-        A bag whose file ended with an error, or was deleted, gets no ``metadata.yaml``:
-        ``psd-deflection recover`` makes one from the files, and our reader needs none. All is
-        written in the folder that the bag was made in, wherever that has been moved.
+        There is no ``metadata.yaml`` if writing a file failed, or it is no longer in the folder:
+        ``psd-deflection recover`` makes one from the files, and our reader needs none. If the folder
+        was moved, the bag is completed at its new place.
         """
         if self.closed:
             self._held.close()
@@ -409,7 +413,10 @@ class BagWriter(_RecordSink):
             self._held.close()
 
     def discard(self) -> None:
-        """Close and delete a bag into which nothing was written. Raises OSError, RecordingError if the disk rejects."""
+        """Close and delete a bag into which nothing was written.
+
+        Raises OSError or RecordingError if the disk cannot be written.
+        """
         ours = self.in_place
         self._file.close()
         self._held.remove(self.path.name)

@@ -1,9 +1,9 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Writes one MCAP file: chunks with the indexes of their messages, and the summary at the end.
+"""Writes one MCAP file: chunks, each followed by its message indexes, and the summary at the end.
 
-The format: https://mcap.dev/spec. The indexes of the chunks wait in a file until the end: a kilobyte per chunk,
-180 MB a day.
+The format: https://mcap.dev/spec. The chunk indexes, a kilobyte each (180 MB a day), wait in a second file until the
+end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from psd_deflection.recordings.mcap_format import (
 )
 
 _CHUNK_BYTES = 1 << 20
-"""A chunk ends when it is longer, uncompressed."""
+"""A chunk ends once it has more than this many bytes, uncompressed."""
 
 _ENTRY = struct.Struct('<QQ')
 _MESSAGE_INDEX = struct.Struct('<HI')
@@ -42,9 +42,9 @@ _U64 = struct.Struct('<Q')
 
 
 class McapWriter:
-    """Writes to ``stream``, from its present beginning to ``finish``. ``spool``: an empty file for the indexes.
+    """Writes one MCAP file to ``stream``, which is empty. ``spool``: an empty file for the chunk indexes.
 
-    The calls raise OSError if the disk cannot be written. Nothing is closed.
+    The calls raise OSError if the disk cannot be written. Neither file is closed.
     """
 
     def __init__(self, stream: BinaryIO, spool: BinaryIO, *, library: str) -> None:

@@ -62,7 +62,7 @@ class Isolable:
 
     def tree(self) -> dict[str, Any]:
         """As isolable.json has it."""
-        names = ('label', 'parameter', 'unit', 'seen', 'named', 'alike', 'apart')
+        names = ('label', 'parameter', 'unit', 'observed', 'named', 'alike', 'apart')
         return {name: getattr(self, name) for name in names}
 
     @property
@@ -137,7 +137,7 @@ class Isolability(StudyResult):
         return Table(
             text_column('effect', [f.label for f in effects], 'that may be there'),
             [
-                Column('seen', sizes[:, 0], '', 'from this size on'),
+                Column('observed', sizes[:, 0], '', 'from this size on'),
                 Column('named', sizes[:, 1], '', 'from this size on'),
                 text_column('unit', [f.unit for f in effects], 'of the sizes'),
                 text_column('alike', [f.alike for f in effects], 'what it is mistaken for'),
