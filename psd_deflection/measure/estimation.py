@@ -234,12 +234,12 @@ class Estimation:
         ``fits``: as :meth:`fits` has them, from this block on.
         """
         verdict = block.verdict
-        variances = self._variances_of(block)
+        variances = self._with_light(block, self.variances[len(block.slots) - 1])
         if verdict.status is BlockStatus.OK:
             readings = self._readings(self.estimator.full, next(fits), block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
-            variances = self.estimator.mean_variances(len(block.slots))
+            variances = self._with_light(block, self.estimator.mean_variances(len(block.slots)))
         subset = self._subset(verdict.sound, block, variances) if len(verdict.sound) > 1 else None
         if subset is not None:
             return self._solve_consistent(block, block.means, variances, subset)
@@ -452,16 +452,15 @@ class Estimation:
         return tuple(own.ravel().tolist())
 
     def _covariance_of(self, block: ValidBlock, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
-        """Return the fit's covariance (C, C) of the readings ``columns``, widened as in :meth:`_variances_of`."""
+        """Return the fit's covariance (C, C) of the readings ``columns``, widened as in :meth:`_with_light`."""
         if not block.verdict.findings:
             return covariance
         background = np.repeat(self._optics.background_variance(block.mean_sums), 2)
         more = 4.0 if block.verdict.half_light else 1.0
         return more * covariance + np.diag(background[list(columns)])
 
-    def _variances_of(self, block: ValidBlock) -> tuple[float, ...]:
-        """Variances of the dots' means, m^2: from the noise, and from missing or foreign light."""
-        variances = self.variances[len(block.slots) - 1]
+    def _with_light(self, block: ValidBlock, variances: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the ``variances`` of the dots' means, m^2, from noise, with those of missing and of foreign light."""
         if not block.verdict.findings:
             return variances
         background = np.repeat(self._optics.background_variance(block.mean_sums), 2).tolist()

@@ -176,6 +176,17 @@ def test_other_light_is_reported_and_widens_the_covariance() -> None:
     assert estimate.covariance[8] > 1e4 * clean.covariance[8]
 
 
+def test_other_light_on_the_only_detector_widens() -> None:
+    """Also once the noise is measured, and the other detector is dark."""
+    counts = np.concatenate([moving(150)] * 2)
+    counts[3000:, 2] = np.int16(round(8.0 / STEP))
+    counts[5900:, 5] = 0
+    records = records_of(Pipeline(load_rig(overrides={'degraded': 'zero'})), counts)
+    last = [r for r in records if isinstance(r, DeflectionEstimate)][-1]
+    assert last.solver == 'one_psd'
+    assert last.covariance[0] ** 0.5 > 0.9 * 3 / 8 * 5e-3 / 3**0.5
+
+
 @pytest.fixture
 def half_lit() -> Counts:
     counts = moving(1)
