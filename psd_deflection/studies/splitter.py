@@ -112,9 +112,7 @@ def rules(rig: Rig, lasers: Lasers) -> list[SplitterRule]:
     # The page and the covariance know of the failure by this.
     shares = [power / both for power in lasers.powers]
     low, high = HALF_LIGHT
-    out.append(
-        SplitterRule('one that is out is reported: smaller share', min(shares), low, '', low < min(shares) <= high)
-    )
+    out.append(SplitterRule('a failure is noticed: smaller share', min(shares), low, '', low < min(shares) <= high))
     for i, power in enumerate(lasers.powers, 1):
         satisfied = power <= 2.0 * lasers.allowed
         out.append(SplitterRule(f'as spares: laser {i}', power, 2.0 * lasers.allowed, 'W', satisfied))
