@@ -175,7 +175,10 @@ def reported(records: Iterable[Record]) -> list[str]:
     return [repr(r) for r in records if isinstance(r, DeflectionEstimate | TipLoad | SpotMeans)]
 
 
-@pytest.mark.parametrize('label', CASES)
+SLOW = ('ten bits', 'fit of two of three PSDs')
+
+
+@pytest.mark.parametrize('label', [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])
 def test_a_recording_begun_at_any_block_replays_to_the_bit(label: str) -> None:
     case, volts = CASES[label], pushed()
     rig = load_rig(overrides=case.rig)

@@ -237,6 +237,7 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
     return {name: (m, topic, reported[name]) for topic, some in topics.items() for name, m in some.items()}
 
 
+@pytest.mark.slow
 def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program, peer: Any) -> None:
     plant = Plant(peer.node)
     free = 2e-3

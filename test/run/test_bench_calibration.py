@@ -85,6 +85,7 @@ def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) 
     assert bench.looks == pytest.approx([0.0, 3.0, 5.0], abs=2 * LOOK_S)
 
 
+@pytest.mark.slow
 @pytest.mark.repeatable
 def test_its_last_answer_is_that_of_the_recording(bag: Path, tmp_path: Path) -> None:
     last = list(Bench(bag, tmp_path / 'growing').steps())[-1]

@@ -53,11 +53,16 @@ EVERY = [
 
 
 STRONG = [
-    pytest.param(typical(effect, choice, 100.0), id=f'{name}-{[int(v) for v in choice.values()]}')
+    pytest.param(
+        typical(effect, choice, 100.0),
+        id=f'{name}-{[int(v) for v in choice.values()]}',
+        marks=pytest.mark.slow if number else (),
+    )
     for name, effect in catalogue().items()
     if effect.stage in ('load', 'link')
-    for choice in effect.variants()
+    for number, choice in enumerate(effect.variants())
 ]
+"""The first variant of each effect is quick."""
 
 
 def rig_values(effects: list[ActiveEffect]) -> dict[str, object]:

@@ -102,7 +102,7 @@ STICKING_OUT = """(() => {
 """What is wider than what it lies in, or than itself, where the numbers are long."""
 
 
-@pytest.mark.parametrize('how', ['node', 'alone'])
+@pytest.mark.parametrize('how', [pytest.param('node', marks=pytest.mark.slow), 'alone'])
 def test_daemon_on_simulated_rig_shows_moving_dots(page: Page, start: Start, tmp_path: Path, how: str) -> None:
     if how == 'node' and importlib.util.find_spec('rclpy') is None:
         pytest.skip('the node needs rclpy: pip install .[ros]')

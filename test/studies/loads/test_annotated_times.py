@@ -158,6 +158,7 @@ def test_motion_that_no_ramp_describes_is_left_out() -> None:
     assert 'at rest' in found.notes[0].words('x.csv')
 
 
+@pytest.mark.slow
 def test_check_and_calibrate_say_the_same() -> None:
     expected = corrected(QUIET, annotated(LATE))
     assert expected is not None

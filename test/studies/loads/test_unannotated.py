@@ -33,6 +33,7 @@ STOPPED[4 * DWELL :] = 0.0
 VOLTS = read(HELD)
 
 
+@pytest.mark.slow
 def test_check_calibrate_and_discover_say_the_same() -> None:
     words = f'x: from 8.000 s to the end the load changed 8 times, and {WORDS}'
     checked, known, log, found = answers(VOLTS, STOPPED)

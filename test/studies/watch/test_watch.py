@@ -45,6 +45,7 @@ def test_a_sound_rig_has_no_alarm() -> None:
     assert 'the rig is its model' in found.report()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings('ignore:.*lacks its parameters')
 def test_a_bump_is_reported_as_by_the_command(bumped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with np.errstate(all='raise'):
