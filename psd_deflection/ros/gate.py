@@ -64,8 +64,8 @@ class InputGate:
         type_name: str = '',
     ) -> list[Subscription]:
         """Subscribe to ``topic``, by its first row: ``take`` gets each message that ``check`` finds nothing wrong with.
-        By another row, which is latched, as soon as :meth:`subscribe_to_kept` finds a publisher for it.
 
+        A further row, which is latched, waits until :meth:`subscribe_to_kept` finds a publisher for it.
         ``name``: on the graph, if it is not the topic's own. ``type_name``: of the message, if a parameter names it.
         A publisher whose messages cannot come, because they have to be reliable, counts as a rejection. Raises KeyError
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
