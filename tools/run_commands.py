@@ -105,6 +105,9 @@ SHORTER = {
     r'^python -m blind\.calibration\b': '--rigs 2',
     r'^python -m bench\.campaign\.hold\b': '--times 1',
     r'^python -m bench\.cpu$': '--seconds 2',
+    r'^python -m bench\.rigs$': '--seconds 1 --most 2',
+    r'^python -m bench\.first_look --times \d+$': '--times 1',
+    r'^python -m tools\.shots --widths$': '--seconds 5',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""
