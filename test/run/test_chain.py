@@ -97,6 +97,37 @@ def test_the_end_effector_is_composed_of_both(running: Running) -> None:
     assert first == second
 
 
+def test_one_end_effector_is_composed_at_a_time(running: Running, file: ChainFile) -> None:
+    running.until(lambda c: c.end is not None)
+    running.chain.close()
+    first = running.chain.sessions[0].pipeline.last_estimate
+    assert first is not None
+    second = first._replace(t_ns=first.t_ns + 20_000_000)
+    chain = ChainSession(file, null_log)
+    inside, go_on, composed = threading.Event(), threading.Event(), []
+
+    def listener(one: Composed) -> None:
+        composed.append(one.t_ns)
+        inside.set()
+        go_on.wait(WAIT_S)
+
+    chain.listeners.append(listener)
+    threads = [threading.Thread(target=chain.take, args=(link, e)) for e in (first, second) for link in (0, 1)]
+    for thread in threads[:2]:
+        thread.start()
+    assert inside.wait(WAIT_S)
+    for thread in threads[2:]:
+        thread.start()
+    # Neither is taken while the first is composed.
+    threads[2].join(0.2)
+    assert threads[2].is_alive()
+    go_on.set()
+    for thread in threads:
+        thread.join(WAIT_S)
+    chain.close()
+    assert composed == [first.t_ns, second.t_ns]
+
+
 def test_a_link_that_is_away_is_missing_and_named(running: Running, devices: list[ScriptedDevice]) -> None:
     last = running.until(lambda c: c.end is not None)
     devices[1].unplug()
