@@ -96,8 +96,10 @@ def test_a_start_that_came_late_is_no_jump_of_the_clock(up_us: int) -> None:
     assert clock.observe(up_us + 200_000, 41 * MS, passed_us=20_000.0)
     assert clock.resets == 1
     # Who knows that it cannot be followed says so, and it counts.
+    at = clock.host_ns(up_us)
     clock.lay_anew(up_us, 50 * MS)
     assert clock.resets == 2
+    assert clock.stepped_ns == -79_500_000 + (50 * MS - at)
     assert clock.host_ns(up_us) == 50 * MS
 
 
@@ -165,6 +167,31 @@ def test_clock_off_by_two_milliseconds_is_fitted_early(ppm: float, seconds: int,
         clock.observe(10_000 * k, ahead + round(10 * MS * k * (1.0 + ppm * 1e-6)) + 200_000)
         fitted = k >= seconds * 100
         assert clock.state().skew_ppm == pytest.approx(ppm if fitted else 0.0, abs=0.01), k
+
+
+@pytest.mark.parametrize(
+    ('drift_ns', 'above_ns', 'fitted'), [(1_999_999, 0, False), (2_000_000, 0, True), (9_000_000, 1_000_000, False)]
+)
+def test_two_milliseconds_in_three_seconds_are_a_rate(drift_ns: int, above_ns: int, fitted: bool) -> None:
+    """Three least delays, half a second after each first sample, which is 3 ms late; the middle one is off the line."""
+    clock = ClockMap()
+    for half in range(7):
+        late = 3 * MS if half % 2 == 0 else (drift_ns * (half // 2) + 1) // 2 + (above_ns if half == 3 else 0)
+        clock.observe(500_000 * half, 500 * MS * half + late)
+    assert clock.state().points == 3
+    assert (clock.state().skew_ppm != 0.0) == fitted
+
+
+@pytest.mark.parametrize(('late_share', 'step'), [(0.099, 21 * MS), (0.101, 0), (-0.099, 21 * MS), (-0.101, 0)])
+def test_a_line_that_drains_steps_by_two_milliseconds(late_share: float, step: int) -> None:
+    """After a step samples come 21 ms early again, faster than their clock goes by."""
+    clock = ClockMap()
+    clock.observe(0, 1000 * MS)
+    assert not clock.observe(100_000, 1000 * MS, passed_us=100_000.0)
+    assert clock.drains
+    assert clock.stepped_ns == -100 * MS
+    clock.observe(121_000, 1000 * MS, passed_us=21_000.0 * (1.0 + late_share))
+    assert clock.stepped_ns == -100 * MS - step
 
 
 def test_a_map_that_was_shown_nothing_is_the_identity() -> None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.signal import periodogram
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import modes as module
@@ -24,6 +25,8 @@ from psd_deflection.studies.identify.modes import (
     scan_windows,
     seed_windows,
     split_mode,
+    trim,
+    variance_at,
     variance_of,
     with_right_order,
 )
@@ -208,6 +211,61 @@ def test_modes_that_beat_are_added_until_nothing_is_left() -> None:
     np.testing.assert_allclose(sorted(fit.modes), [(15.7, 0.01), (16.3, 0.01)], rtol=0.01)
 
 
+def trimmed(
+    scatter: Sequence[float],
+    monkeypatch: pytest.MonkeyPatch,
+    pattern: Sequence[float] = (1.0, -1.0),
+    piece: int = 16,
+) -> tuple[int, int] | None:
+    """What is kept of pieces of so many samples, a quarter of a period, that leave so much."""
+    samples = np.zeros(3000)
+    s = Stretch(samples, 100, 100 + piece * len(scatter), RATE)
+    residual = np.repeat(scatter, piece) * np.resize(pattern, piece * len(scatter))
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
+    kept = trim(s, samples, RATE, [(RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
+    return None if kept is None else (kept.first, kept.last)
+
+
+def test_the_ends_that_fit_worse_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of alternating errors each of 16 counts: worse than 1 + 4 / sqrt(32) times the usual."""
+    limit = 1.0 + 4.0 / math.sqrt(32.0)
+    usual = [1.0] * 40
+    assert trimmed(usual, monkeypatch) == (100, 740)
+    assert trimmed([limit * 0.99, *usual[2:], limit * 0.99], monkeypatch) == (100, 740)
+    assert trimmed([limit * 1.01, *usual[2:], limit * 0.99], monkeypatch) == (116, 740)
+    assert trimmed([limit * 0.99, *usual[2:], limit * 1.01], monkeypatch) == (100, 724)
+    # The bad one nearest to the middle counts; the one in the middle is of the second half.
+    assert trimmed([1.0, 9.0, 1.0, 9.0, *usual[7:], 9.0, 1.0, 1.0], monkeypatch) == (100 + 64, 740 - 48)
+    assert trimmed([*usual[:20], 9.0, *usual[21:]], monkeypatch) == (100, 420)
+    assert trimmed([*usual[:19], 9.0, *usual[20:]], monkeypatch) == (420, 740)
+
+
+def test_of_a_memory_of_0_95_a_fortieth_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a memory of 0.95 there are 0.05/1.95; of 64 samples that is 1.64."""
+    limit = 1.0 + 4.0 / math.sqrt(2.0 * 64.0 * 0.05 / 1.95)
+    assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, (1.0,), 64) == (100, 2660)
+    assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, (1.0,), 64) == (100, 2596)
+
+
+def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = np.zeros(200)
+    s = Stretch(samples, 0, 200, RATE)
+    residual = np.ones(200) * np.resize((1.0, -1.0), 200)
+    residual[197] = 50.0
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
+    kept = trim(s, samples, RATE, [(128.0, 0.02)])
+    assert kept is not None
+    assert (kept.first, kept.last) == (0, 196)
+
+
+def test_four_periods_are_left_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A period has four pieces."""
+    assert trimmed([1.0] * 16, monkeypatch) == (100, 356)
+    assert trimmed([1.0] * 15, monkeypatch) is None
+    assert trimmed([*[1.0] * 16, 9.0, *[1.0] * 3], monkeypatch) == (100, 356)
+    assert trimmed([*[1.0] * 15, 9.0, *[1.0] * 4], monkeypatch) is None
+
+
 def test_the_variance_of_what_is_left_is_for_its_freedom() -> None:
     """A mode and a line of each of two stretches are eight, the mode two more."""
     s = stretch(np.zeros(20))
@@ -217,6 +275,32 @@ def test_the_variance_of_what_is_left_is_for_its_freedom() -> None:
     assert variance_of(two, [s, s]) == pytest.approx(9.0 * 40 / 24)
     assert variance_of(two, [s] * 5) == pytest.approx(9.0 * 40 / 6)
     assert variance_of(two, [s] * 6) == pytest.approx(9.0 * 40)
+
+
+@pytest.mark.parametrize(
+    ('n', 'rate', 'frequency', 'half_width', 'count', 'close'),
+    [(1000, 1000.0, 20.0, 6.0, 11, 1), (1000, 1000.0, 20.0, 6.0, 11, 2), (1000, 1000.0, 10.0, 5.0, 9, 1)],
+)
+def test_the_variance_at_a_mode_is_of_its_density(
+    n: int, rate: float, frequency: float, half_width: float, count: int, close: int
+) -> None:
+    """Within 30 % of it, or five lines; the modes there have taken a line each, and another each stretch."""
+    rng = np.random.default_rng(13)
+    residual = np.cumsum(rng.normal(size=n))
+    modes = [(frequency * 1.01, 0.02), *[(frequency * 0.72, 0.02)] * (close - 1), (frequency * 1.31, 0.02)]
+    fit = RingFit(modes, residual, np.eye(2 * len(modes)))
+    f, p = periodogram(residual, rate)
+    near = [v for k, v in zip(f, p, strict=True) if abs(k - frequency) < half_width]
+    assert len(near) == count
+    s = stretch(np.zeros(20))
+    for stretches in (1, 2, 3, 4, 6):
+        free = max(2 * count - 2 * close * (stretches + 1), 2)
+        expected = sum(near) * rate / free
+        # More than the mean, as this noise remembers.
+        assert variance_at(fit, [s] * stretches, rate, frequency) == pytest.approx(
+            max(expected, variance_of(fit, [s] * stretches)), rel=1e-9
+        )
+    assert variance_at(fit, [s], rate, 300.0) == pytest.approx(variance_of(fit, [s]))
 
 
 def test_the_fit_goes_through_the_samples_of_each_stretch() -> None:
