@@ -70,7 +70,7 @@ CI_RUNS = (
     (r'^make docs STEP=commands\b', '.ci/run', 'make docs STEP=commands '),
     (r'^make release STEP=wheel$|^pip install dist/\*\.whl', '.ci/run', 'make release STEP=wheel '),
     (r'^make demo NAME=rerun$', '.ci/run', 'make demo NAME=rerun '),
-    (r'^make shaken$', '.ci/run', 'make shaken '),
+    (r'^make shaken$', '.github/workflows/ci.yml', 'make shaken '),
     (r'^make bits$', '.ci/run', 'make bits '),
     (r"^pip install '\.\[rerun\]'$", 'tools/tasks.py', "'.[rerun]'"),
     (r'^psd-deflection convert .*\.rrd$|^rerun ', 'tools/tasks.py', 'tools.check_rerun bags/'),

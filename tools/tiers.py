@@ -55,8 +55,8 @@ ROOMS: Mapping[str, Room] = {
     ),
     'timing': Room(
         ('psd_deflection/measure/timing.py',),
-        ('test/measure/test_timing.py', 'test/run/test_clock_watch.py', 'test/run/test_acquisition.py'),
-        slow=('test/run/test_pinger.py',),
+        ('test/measure/test_timing.py', 'test/run/test_clock_watch.py'),
+        slow=('test/run/test_acquisition.py', 'test/run/test_pinger.py'),
     ),
     'pipeline': Room(
         (
