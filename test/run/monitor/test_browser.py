@@ -89,6 +89,19 @@ COLORED = """(() => {
   return n;
 })()"""
 """Pixels in the colour of dY."""
+HEIGHTS = """(() => {
+  const canvas = document.querySelector('#plot_shift canvas');
+  const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  const [sums, counts] = [[0, 0], [0, 0]];
+  for (let i = 0; i < data.length; i += 4) {
+    const red = data[i] - data[i + 2];
+    if (data[i + 3] < 200 || Math.abs(red) < 60) continue;
+    sums[red > 0 ? 1 : 0] += i / (4 * canvas.width);
+    counts[red > 0 ? 1 : 0] += 1;
+  }
+  return [sums[0] / counts[0], sums[1] / counts[1]];
+})()"""
+"""Mean rows of the pixels in the colours of dX and of dY; downwards."""
 
 
 STICKING_OUT = """(() => {
@@ -242,12 +255,16 @@ FETCHED = """[...performance.getEntriesByType('navigation'), ...performance.getE
 .reduce((sum, entry) => sum + entry.transferSize, 0)"""
 
 
-def test_the_first_load_is_small(page: Page, serve: Callable[..., Serving]) -> None:
+def test_the_first_load_is_small_and_dx_is_above_dy(page: Page, serve: Callable[..., Serving]) -> None:
     serving = serve()
+    # dX rises from 0 to 1 mm, dY from -1 to 0 mm.
     serving.give(0, 20)
     page.driver.execute_cdp_cmd('Network.clearBrowserCache', {})
     page.open(serving.url)
     page.until('document.body.dataset.rows >= 20')
+    page.until(f'{HEIGHTS}.every(Number.isFinite)', 'traces of dX and dY')
+    dx, dy = page.js(HEIGHTS)
+    assert dx < dy - 20
     assert 20_000 < page.js(FETCHED) < MOST_BYTES
 
 
