@@ -149,7 +149,8 @@ ROOMS: Mapping[str, Room] = {
                 f'test/studies/discover/test_{n}.py'
                 for n in (
                     *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
-                    *('problem', 'limits', 'ties'),
+                    *('problem', 'limits', 'ties', 'predictive', 'smooth', 'slow_noise', 'zero', 'isolable'),
+                    *('undetermined', 'reference_readings'),
                 )
             ),
             # Their pieces: a whole discovery of the catalogue takes seconds.

@@ -278,3 +278,29 @@ def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, rep
     found = checked(levels=of_levels(sums=(5.0, level)))
     words = f'psd_2: sum {level:.2f} V, the rig file says 5 V; see amplifier.sum_nominal'
     assert found.notes == ((words,) if reported else ())
+
+
+@pytest.mark.parametrize(
+    ('drift', 'sd', 'noted'),
+    [
+        ((0.0, 5.1, 0.0, 0.0), 0.06, '+5.1 µm a minute on y1'),
+        ((0.0, 4.9, 0.0, 0.0), 0.06, ''),
+        # The farthest of those that stand out.
+        ((6.0, 0.0, -7.0, 0.0), 0.06, '-7.0 µm a minute on x2'),
+        # Beyond five deviations, and of a short recording nothing.
+        ((0.0, 0.0, 0.0, 7.1), 1.4, '+7.1 µm a minute on y2'),
+        ((0.0, 0.0, 0.0, 7.1), 1.5, ''),
+        ((0.0, 0.0, 0.0, 26.0), 4.99, '+26.0 µm a minute on y2'),
+        ((0.0, 0.0, 0.0, 26.0), 5.01, ''),
+    ],
+)
+def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted(drift: tuple[float, ...], sd: float, noted: str) -> None:
+    minute = 1e-6 / 60.0
+    notes = checked(drift=[minute * d for d in drift], drift_sd=minute * sd).notes
+    assert notes == ((f'drift: {noted}; let lasers and amplifier warm up',) if noted else ())
+
+
+def test_hum_is_noted_where_it_is_largest() -> None:
+    hum = (0.0, 1e-3, 0.0, 4e-3, 0.0, 2e-3)
+    words = 'hum: 4.0 mV at 60 Hz on x2; look at shielding and ground'
+    assert checked(levels=of_levels(hum=hum, hum_hz=60.0)).notes == (words,)

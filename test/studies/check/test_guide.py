@@ -286,8 +286,10 @@ def test_a_push_is_relative_to_the_rests_around_it() -> None:
     assert taken.sd == pytest.approx(wanted)
     # The next one is against that rest.
     fed.feed((4 * MICRO, 100 * MICRO, 0.0, -6 * MICRO), 30)
+    assert fed.guide.moved == pytest.approx([0.0, 1e-4, 0.0, 0.0], abs=1e-12)
     fed.feed((4 * MICRO, 0.0, 0.0, -6 * MICRO), 30)
     assert fed.guide.pushes[1].channels == pytest.approx([0.0, 1e-4, 0.0, 0.0], abs=1e-12)
+    assert fed.guide.pushes[1].sd == pytest.approx([rest, 1e-6, rest, rest])
     # From the first rest, at 2 s, to the last, at 4.4 s, with what handling may shift: 2 um.
     drift, sd = fed.guide.drift()
     assert drift == pytest.approx(np.array([4e-6, 0.0, 0.0, -6e-6]) / 2.4)

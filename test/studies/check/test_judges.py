@@ -66,6 +66,10 @@ NAN = math.nan
         # Pounds of torque are asked for beside pounds of force alone.
         ((4.45, 4.44, 1.36), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'lbf ft instead of N m'}),
         ((4.45, 4.44, 0.113), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'lbf in instead of N m'}),
+        (
+            (NAN, 0.2248, 0.7376),
+            {1: 'N, and then converted from lbf once more', 2: 'N m, and then converted from lbf ft once more'},
+        ),
         ((1.0, 1.0, 1.36), {}),
         # A digit of Young's modulus is no unit: the forces alone, by ten.
         ((10.0, 10.05, 1.0), {}),

@@ -315,6 +315,7 @@ def test_lines_come_strongest_first_each_once() -> None:
     assert got == pytest.approx([71.75, 33.3, 120.1], abs=0.01)
     assert proposals.spectral_peaks(rows, [np.ones(6)] * 2, [1e-3] * 2, 4)[-1] == pytest.approx(200.2, abs=0.02)
     assert proposals.spectral_peaks([r[:255] for r in rows], [np.ones(6)] * 2, [1e-3] * 2) == []
+    assert proposals.spectral_peaks(rows, [np.full(6, 1e6)] * 2, [1e-3] * 2) == pytest.approx(got, abs=1e-4)
     # By the noise of its channel: a line in a channel ten times as noisy is ten times as weak.
     scaled = np.ones(6)
     scaled[3] = 10.0

@@ -18,7 +18,7 @@ from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover import experiment
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
 from psd_deflection.studies.discover.observation import Observation, load_cases
@@ -77,6 +77,34 @@ def test_sweeps_reach_limit_of_exciter_and_samples(limits: Limits, ends: list[st
     """Up to four tenths of the sample rate."""
     chirps = [p.script[0] for p in pieces(RIG, limits) if p.script[0].startswith('chirp')]
     assert [c.split(':', 2)[2] for c in chirps] == ends
+
+
+@pytest.mark.parametrize('zero', [0.0, 5e-4])
+def test_loads_move_the_dots_by_four_fifths_of_their_room(zero: float) -> None:
+    """A force bends by L^3/(3 EI), a torque twists by L/GJ."""
+    rig = replace_values(RIG, {'psd_2.zero': [0.0, -zero], 'link.youngs_modulus': 7e9})
+    link = rig.link
+    bends, twists = link.length**3 / (3.0 * link.bending_stiffness), link.length / link.torsional_stiffness
+    half = 0.5 * min(min(p.active_area) for p in rig.psds)
+    room = 0.8 * (min(half, rig.converter.full_scale * float(rig.sensitivities.min())) - zero)
+    reach = max(math.hypot(*c) for c in rig.centers.tolist())
+    f, t, arm = room / bends, room / (twists * reach), 0.2
+    bar = room / (bends + arm * twists * reach)
+    o, h = (0.0, 0.0, 0.0), (0.0, 0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25, 0.0)
+    turns = [(1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1), (1, 1, -1), (-1, -1, -1)]
+    corners = [(0.5 * f * a, 0.5 * f * b, 0.6 * t * c) for a, b, c in turns]
+    got = [p.script for p in pieces(rig, Limits(force=1e6, torque=1e6, sidebar=arm))]
+    assert got[:7] == [
+        script([o, (0, -f, 0), o, (0, f, 0), o, (f, 0, 0), o, (-f, 0, 0), o], 1.5),
+        script([o, (0, 0, t), o, (0, 0, -t), o], 2.0),
+        script([o, *corners, o], 1.5),
+        script([o, (0, -bar, -bar * arm), o, (0, -bar, bar * arm), o], 2.0),
+        *(script([(s * x, s * y, s * z) for s in h], 1.5) for x, y, z in ((0, -f, 0), (f, 0, 0), (0, 0, t))),
+    ]
+    held = f'constant:0,{round(-0.8 * f, 3):g},{round(-0.3 * t, 3):g}:24'
+    assert got[7:9] == [('constant:0,0,0:1', held, 'constant:0,0,0:14.4'), ('constant:0,0,0:30',)]
+    weights = pieces(rig, Limits(force=1e6, sideways=False))[0].script
+    assert weights == script([o, (0, -f, 0), o, (0, -0.5 * f, 0), o], 2.0)
 
 
 def test_lesser_forces_torques_and_times_are_kept() -> None:

@@ -111,6 +111,14 @@ def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(setup, 'load_sizes', lambda m, w: (0.0 if w in good else m.squared, np.ones(3)))
     _, (finding,), _ = setup.correct_wiring([o], ())
     assert len(finding.equivalent) == 2
+    # One change more each, a sign of a load.
+    sizes = np.array([1.0, 1.0, -1.0])
+    monkeypatch.setattr(setup, 'load_sizes', lambda m, w: (0.0, sizes if w in good else np.ones(3)))
+    assert setup.correct_wiring([o], ())[1:] == ([], {})
+    monkeypatch.setattr(setup, 'load_sizes', lambda m, w: (0.0 if w in good else m.squared, sizes))
+    _, (wiring, sign), _ = setup.correct_wiring([o], ())
+    assert (sign.name, sign.where) == ('load_sign', 'tz')
+    assert all(words.endswith(' and load_sign of tz') for words in wiring.equivalent)
 
 
 # The words of the answer.

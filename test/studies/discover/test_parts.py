@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search import localise, proposals
+from psd_deflection.studies.discover.search.free import LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import cleaning
 from psd_deflection.studies.discover.setup.noise import estimate_noise
+from psd_deflection.studies.loads.fine import fine_means
 
 from .test_formulas import RIG, make_observation
 from .test_rules import FINE, Plant, noise
@@ -142,6 +145,40 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
     assert one['rest_seconds'] == gappy.noise[0].rest_seconds
     lost = dataclasses.replace(gappy.observations[0], volts=np.full((1200, 6), np.nan))
     assert Workspace([lost]).gap(Workspace([lost]).measured) == 0.0
+
+
+def test_free_loads_are_those_of_bayesian_least_squares() -> None:
+    """Two loads that overlap, 2 N and 5 N uncertain: noise of covariance I + A S^2 A', sizes by their priors."""
+    o = make_observation()
+    ws = Workspace([o])
+    changes, sd = np.zeros((2, len(o.loads), 3)), np.array([2.0, 5.0])
+    changes[0, 300:700, 1] = changes[1, 500:, 0] = 1.0
+    changes[1, 500:, 1] = 0.7
+    free = tuple(LoadDirection(0, changes[k], float(sd[k]), 'hung', k) for k in range(2))
+    own = ws.with_free(free)
+
+    def shown(loads: FloatArray) -> list[FloatArray]:
+        return [fine_means(ForwardModel(o.rig).expect(loads, o.temperature).volts, 4)]
+
+    (still,) = shown(o.loads)
+    a = np.stack([ws.whiten([moved - still for moved in shown(o.loads + c)]) for c in changes], axis=1)
+    inverse = np.linalg.inv(a.T @ a + np.diag(1.0 / sd**2))
+    rng = np.random.default_rng(0)
+    one, other = (o.rig.noises.ravel()[:, None] * rng.standard_normal(still.shape) for _ in range(2))
+    r, s = ws.whiten([one]), ws.whiten([other])
+    assert own.whiten([one]) @ own.whiten([other]) == pytest.approx(r @ s - (a.T @ r) @ inverse @ (a.T @ s), rel=1e-6)
+    want = np.sqrt(np.diag(inverse))
+    assert own.direction_sd() == pytest.approx({(id(free[0].of), k): v for k, v in enumerate(want.tolist())}, rel=1e-6)
+    # Beside what another 3 N and 1 N leave, and only then is it worth a simulation more.
+    off = [one + moved - still for moved in shown(o.loads + 3.0 * changes[0] - changes[1])]
+    sizes = inverse @ a.T @ ws.whiten(off)
+    loads = o.loads + np.tensordot(sizes, changes, 1)
+    for again in (own.refitted(off), own.refitted_beside(off, ())):
+        np.testing.assert_allclose(again.observations[0].loads, loads, atol=1e-6)
+        assert len(again.directions) == 2
+    assert own.refitted_beside([np.zeros_like(one)], ()) is own
+    assert (ws.direction_sd(), ws.refitted(off), ws.refitted_beside(off, ())) == ({}, ws, ws)
+    assert ws.with_free((ZeroDirection(0, 1, 1e-6),)).refitted_beside(off, ()).observations[0] is o
 
 
 # Noise.

@@ -267,7 +267,7 @@ def test_neighbours_that_follow_each_other_are_fewer_values() -> None:
     assert PlantComparison(Pictures(slow, {})).independent.tolist() == [116.0, 180.0]
 
 
-def test_what_a_plant_simulates_is_what_the_model_says() -> None:
+def test_what_a_plant_simulates_is_what_the_model_says(monkeypatch: pytest.MonkeyPatch) -> None:
     observed = holed()
     plant = Pictures(observed, {'a': tables(4), 'b': tables(5)}, nuisance=(size_of('b', nominal=2.0),))
     plant.library = (size_of('a'),)
@@ -292,6 +292,11 @@ def test_what_a_plant_simulates_is_what_the_model_says() -> None:
     plant.shown = {'a': tables(4)[:2]}
     with pytest.raises(ConfigError, match='simulate: 2 tables for 3 cases'):
         ws.simulate([on('a', 1.0)])
+    # Even if a channel may be exact.
+    plant.observed = [np.where([[True], [False]], 1.0, rows) for rows in observed]
+    monkeypatch.setattr(plant, 'simulate', lambda model: [np.ones((2, n)) for n in LENGTHS[:2]])
+    with pytest.raises(ConfigError, match='simulate: 2 tables for 3 cases'):
+        PlantComparison(plant)
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.model.simulation.declaration import EffectParameter
+from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plant_search import PlantDiscovery
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.search import predictive
+from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.screen import Screen
+
+from .test_rules import FINE, SIGMA, active, candidate, columns, noise, pictures
+from .test_rules import Plant as LinearPlant
 
 TERMS = 30
 
@@ -131,3 +140,88 @@ def test_the_zero_of_a_run_left_out_is_not_known(zeros: PlantDiscovery) -> None:
     assert sorted(e.name for e in zeros.effects) == ['zero_1', 'zero_2', 'zero_3', 'zero_4']
     assert zeros.gap_after < 0.06
     assert zeros.gap_heldout_after == pytest.approx(zeros.gap_before, rel=0.01)
+
+
+# The pieces, by counting all subsets and by least squares of numpy.
+
+
+def all_subsets(f: FloatArray, g: FloatArray, energy: float, size: float) -> tuple[FloatArray, FloatArray]:
+    """Mean sizes of the terms, and how likely each takes part, over all subsets and precisions of the sizes."""
+    count = len(g)
+    rows = []
+    for inside in itertools.product((False, True), repeat=count):
+        n, at = sum(inside), np.flatnonzero(inside)
+        for slab in predictive.SLABS:
+            room = f[np.ix_(at, at)] + slab * np.eye(n)
+            mean = np.linalg.solve(room, g[at])
+            log = 0.5 * (n * np.log(slab) - np.linalg.slogdet(room)[1]) - np.log(math.comb(count, n))
+            rows.append((log - 0.5 * size * np.log(energy - mean @ g[at]), at, mean))
+    most = max(log for log, _, _ in rows)
+    sizes, weights, total = np.zeros(count), np.zeros(count), 0.0
+    for log, at, mean in rows:
+        p = np.exp(log - most)
+        sizes[at] += p * mean
+        weights[at] += p
+        total += p
+    return sizes / total, weights / total
+
+
+@pytest.mark.parametrize(('slabs', 'near'), [(predictive.SLABS, 0.06), (np.array([1.0]), 0.02)])
+def test_averages_are_those_over_all_subsets(slabs: FloatArray, near: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(predictive, 'WALK', (1000, 8, 1000))
+    monkeypatch.setattr(predictive, 'SLABS', slabs)
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal((80, 4))
+    x[:, 1] += 0.8 * x[:, 0]
+    y = 0.4 * x[:, 0] + 0.25 * x[:, 2] + 0.9 * rng.standard_normal(80)
+    given = (x.T @ x, x.T @ y, float(y @ y), 80.0)
+    sizes, weights = predictive.averaged(*given, rng)
+    want, likely = all_subsets(*given)
+    np.testing.assert_allclose(weights, likely, atol=near)
+    np.testing.assert_allclose(sizes, want, atol=0.3 * near)
+    # What is explained already, and nothing to explain.
+    f = np.diag([80.0, 80.0 * 1e-7])
+    sizes, weights = predictive.averaged(f, np.array([40.0, 1e-9]), 80.0, 80.0, rng)
+    assert sizes == pytest.approx([40.0 / 81.0, 0.0], rel=0.05, abs=1e-6)
+    for nothing in (predictive.averaged(1e-7 * f, f[0], 80.0, 80.0, rng), predictive.averaged(f, f[0], 0.0, 80.0, rng)):
+        np.testing.assert_array_equal(nothing, np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(('size', 'remains'), [(0.5, True), (0.0, False)])
+def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool) -> None:
+    """Small terms beside a named effect of which one number, 900 times the noise, is no amplitude."""
+    names = ('a', 'x'), ('a', 'shape'), ('b', 'x'), ('b', 'y'), ('c', 'x')
+    truth = (SIGMA, 0.9, size * SIGMA, -0.8 * size * SIGMA, 0.6 * size * SIGMA)
+    shown = pictures(*names)
+    plant = LinearPlant(shown, sum((v * shown[n] for n, v in zip(names, truth, strict=True)), noise()))
+    a = active('a', x=0.5, shape=0.1)
+    x, shape = a.effect.parameters
+    both = (x, dataclasses.replace(shape, kind='shape'))
+    fit = refit(plant, [ActiveEffect(dataclasses.replace(a.effect, parameters=both), a.values)])
+    found = [
+        (candidate('b', 'x', 'y'), [[1e-3 * shown['b', 'x']], [1e-3 * shown['b', 'y']]]),
+        (candidate('c', 'x'), [[1e-3 * shown['c', 'x']]]),
+    ]
+    got = predictive.predictive_of(plant, fit, Screen(plant, found), np.random.default_rng(0))
+    assert got is not None
+    table, y = columns(shown, *names) * SIGMA, plant.measured[0].ravel()
+    fold = np.tile(plant.case[0] % 4, 6)
+
+    def unseen(columns: FloatArray) -> float:
+        rest = np.empty_like(y)
+        for k in range(4):
+            sizes = np.linalg.lstsq(columns[fold != k], y[fold != k], rcond=None)[0]
+            rest[fold == k] = y[fold == k] - columns[fold == k] @ sizes
+        return plant.gap([rest.reshape(6, FINE)])
+
+    assert got.unseen_named == pytest.approx(unseen(table[:, :2]), rel=1e-6)
+    assert got.unexplained is remains
+    assert (got.tree() is None) is not remains
+    if remains:
+        assert got.unseen == pytest.approx(unseen(table), rel=2e-3)
+        assert [t.name for t in got.terms] == ['b x', 'b y', 'c']
+        want = np.linalg.lstsq(table, y, rcond=None)[0]
+        assert [t.value for t in got.terms] == pytest.approx(want[2:].tolist(), rel=0.02)
+        assert [t.weight for t in got.terms] == pytest.approx([1.0] * 3, abs=1e-3)
+        values = [v for a in got.effects for v in a.values.values()]
+        assert values == pytest.approx(want.tolist(), rel=0.02)

@@ -16,8 +16,18 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation
 from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.weighing import Unknown
 from psd_deflection.studies.discover.setup.hidden import FIRST
-from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_effect
+from psd_deflection.studies.discover.steps import (
+    alternatives,
+    fields_of,
+    predict,
+    search,
+    solve,
+    weigh,
+    where,
+    without_effect,
+)
 
 from .test_rules import A, B, Lone, Plant, candidate, noise, nowhere, pictures, without_noise
 
@@ -83,6 +93,19 @@ def test_nothing_is_missing_in_noise() -> None:
     fields = fields_of(last)
     assert (fields['verdict'], last.named, last.fit) == ('nothing_missing', (), last.null)
     assert fields['gap_before'] == fields['gap_after'] == fields['gap_heldout_after']
+
+
+@pytest.mark.parametrize(('level', 'asked'), [(1.3, False), (1.8, True)])
+def test_predictions_are_asked_for_beyond_one_and_a_half_floors(level: float, asked: bool) -> None:
+    words: list[str] = []
+    first = Problem.of(Library(Plant(pictures(A, B), level * noise())), 0, words.append, np.random.default_rng(0))
+    searched = search(first)
+    assert first.comparison.gap(searched.fit.difference) == pytest.approx(level * first.comparison.floor(), rel=0.1)
+    after = predict(searched)
+    assert ('predicting' in words) is (after.predictive is not None) is asked
+    # What is unknown is asked for, however little.
+    unknown = dataclasses.replace(searched, unknown=(Unknown('x', (), 0.1),))
+    assert predict(unknown).predictive is not None
 
 
 def test_unexplained_remainder_drops_weak_effects() -> None:

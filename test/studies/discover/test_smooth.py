@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -123,6 +124,11 @@ def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     inverse = np.linalg.inv(size**2 * np.exp(-0.5 * apart['x'] / length**2) + noise**2 * np.eye(n))
     p = inverse - inverse @ free @ np.linalg.inv(free.T @ inverse @ free) @ free.T @ inverse
     np.testing.assert_allclose(residual, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
+    # What an effect cannot do here has no size.
+    idle = dataclasses.replace(remains, sizes=np.column_stack([free, np.zeros(n)]))
+    shapes = np.log([[noise, size, length]])
+    again = unseen_residual(idle, ('x',), shapes, np.ones(n, dtype=bool), shaped=True)
+    np.testing.assert_allclose(again, residual, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow

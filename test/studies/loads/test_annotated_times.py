@@ -100,6 +100,15 @@ def test_right_times_and_small_delay_are_unchanged(loads: FloatArray) -> None:
     assert corrected(ROTATED, loads) is None
 
 
+def test_slow_loads_noted_as_steps_are_ramps() -> None:
+    found = corrected(volts(applied(0.8)), annotated((0.4,) * 6))
+    assert found is not None
+    assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
+    assert {n.name for n in found.notes} == {'load_ramp'}
+    assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
+    assert not found.unused.any()
+
+
 def test_other_natural_frequencies_change_no_time() -> None:
     read = volts(applied(), dynamics__bending_frequency=14.7, dynamics__torsion_frequency=20.4)
     assert corrected(read, annotated((0.0,) * 6)) is None

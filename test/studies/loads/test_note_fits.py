@@ -78,6 +78,24 @@ def test_step_time_is_fitted_beside_drift_and_ringing(start: float, took: float,
     assert found == pytest.approx((start, took), abs=1e-3 if took else 2e-5)
 
 
+@pytest.mark.parametrize(
+    ('between', 'window'),
+    [
+        # A second before the step and two after it,
+        ((0.0, 9000.0), (3900, 7100)),
+        # but not nearer than a tenth of a second to the steps before and after,
+        ((4000.4, 6000.6), (4101, 5900)),
+        # and the stretch of the step itself in any case.
+        ((4950.0, 5050.0), (4900, 5100)),
+    ],
+)
+def test_a_step_is_fitted_without_its_neighbours(between: tuple[float, float], window: tuple[int, int]) -> None:
+    looked = Looked(moved_by(5.0, 0.0, 9000))
+    step = steps_module.DotStep(5000.0, 1e-4, 4900, 5100)
+    steps_module.time_of_step(RIG, cast(FloatArray, looked), step, between, 1e-3)
+    assert {(part.start, part.stop) for part in looked.parts} == {window}
+
+
 def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
     class Later(Looked):
         def __len__(self) -> int:

@@ -47,6 +47,24 @@ def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: CorrectedNo
     assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
 
 
+@pytest.mark.parametrize(
+    ('one', 'name', 'value', 'size', 'wrong'),
+    [
+        (note(3.0, 1.0, 1.75), 'load_time', 2.0, 2.0, True),
+        # As late as it took: noted when it was done.
+        (note(3.0, 1.0, 2.0), 'load_ramp', 2.0, 2.0, True),
+        (note(1.0, 3.0, 2.5), 'load_ramp', 2.5, 2.0, True),
+        # Two milliseconds are no delay.
+        (note(0.002, 0.0), 'load_ramp', 0.0, 0.002, False),
+        (note(0.0, 0.0021), 'load_time', -0.0021, 0.0021, True),
+    ],
+)
+def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
+    one: CorrectedNote, name: str, value: float, size: float, wrong: bool
+) -> None:
+    assert (one.name, one.where, one.value, one.size, one.wrong) == (name, 'load 3', value, size, wrong)
+
+
 def test_ordinals_end_as_their_last_word() -> None:
     def ending(number: int) -> str:
         # eleventh, twelfth, thirteenth ... nineteenth

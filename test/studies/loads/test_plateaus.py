@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import replace_values
 from psd_deflection.studies.loads import plateaus
 from psd_deflection.studies.loads.annotated_times import correct_loads, unannotated_steps
 from psd_deflection.studies.loads.plateaus import (
@@ -210,6 +211,24 @@ def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     assert [(p.number, p.unannotated) for p in listed] == [(0, False), (1, False), (1, True), (2, False)]
     assert [p.first for p in listed] == pytest.approx([0, 2000, 4000, 6000], abs=2)
     assert [p.last for p in listed] == pytest.approx([2000, 4000, 6000, 8000], abs=2)
+
+
+def test_steps_without_a_note_are_looked_for_in_metres() -> None:
+    """A volt of noise on a detector of 10 µm/V hides no step of 1 mm on one of 1 mm/V."""
+    rig = replace_values(RIG, {'psd_1.sensitivity': [1e-3, 1e-3], 'psd_2.sensitivity': [1e-5, 1e-5]})
+    volts, loads = np.zeros((9000, 6)), np.zeros((9000, 3))
+    volts[:, 3] = np.random.default_rng(1).standard_normal(9000)
+    volts[2000:, 0] += 1.0
+    volts[4000:, 1] += 1.0
+    loads[4000:] = 1.0
+    listed = plateaus.plateaus(rig, volts, loads)
+    assert [p.first for p in listed] == pytest.approx([0, 2000, 4000], abs=50)
+    assert [(p.number, p.unannotated, p.end_unannotated) for p in listed] == [
+        (0, False, True),
+        (0, True, False),
+        (1, False, False),
+    ]
+    assert len(plateaus.plateaus(rig, volts, loads, annotated_only=True)) == 2
 
 
 VARIED = np.array(

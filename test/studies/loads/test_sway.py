@@ -13,7 +13,7 @@ import pytest
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.loads import sway
-from psd_deflection.studies.loads.plateaus import Plateau, implied_beside_rig, plateaus
+from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, implied_beside_rig, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
 from test.studies.held_loads import DWELL, HELD, RIG, T, answers, read
 
@@ -105,3 +105,27 @@ def test_a_peak_is_the_vertex_of_a_log_parabola() -> None:
     assert sway.peak_frequency(f, np.zeros(4)) == 0.0
     assert sway.peak_frequency(f[:2], np.array([1.0, 3.0])) == 1.0
     assert sway.peak_frequency(np.zeros(0), np.zeros(0)) == 0.0
+
+
+def test_a_swing_is_what_no_constant_load_explains() -> None:
+    """A tone of 1.3 Hz that fades from 2 N, in means of four samples."""
+    n, size = 4000, 4
+    held = tuple(Plateau(0, n * k, n * (k + 1), k, False, np.zeros(3)) for k in range(6))
+    t = np.arange(n) * 1e-3
+    force = 2.0 * (1.0 - 0.1 * t) * np.sin(2.0 * math.pi * 1.3 * t + 0.4)
+    rest = 1e-9 * np.random.default_rng(0).standard_normal((3, 6 * n // size))
+    rest[1, 3 * n // size : n] += 2e-5 * force.reshape(-1, size).mean(axis=1)
+    none = np.zeros((6, 3))
+    implied = PlateauLoads(held, none, rest, rest, rest[:1], none[:, 0], np.array([1e-5, 2e-5, 1e-4]), size)
+    (found,) = sway.swaying(implied, held, lambda _: implied, 1e-3)
+    assert found.plateau is held[3]
+    assert [found.frequency, found.force] == [pytest.approx(1.3, abs=0.01), pytest.approx(1.6, abs=0.1)]
+    assert found.swung is not None
+    np.testing.assert_allclose(found.swung[:, 1], force, atol=5e-3)
+    assert np.abs(found.swung[:, [0, 2]]).max() < 1e-3
+    # Of two lost holds nothing is known, and what is less than eight times the median is no sway.
+    lost = rest.copy()
+    lost[:, n // size : 3 * n // size] = np.nan
+    lost[1, n:] += 2e-6 * np.tile(force, 2).reshape(-1, size).mean(axis=1)
+    implied = dataclasses.replace(implied, rest=lost)
+    assert [s.plateau for s in sway.swaying(implied, held, lambda _: implied, 1e-3)] == [held[3]]
