@@ -36,6 +36,8 @@ MOST_WORDS = 20
 """So many marks have their words beside them, the first; the others are lines only."""
 GAP = 1.5
 """Median steps of time from which on a line breaks: the next value is missing."""
+SQUEEZED = 1e-3
+"""Median steps of time below which a line breaks: the stamps are raised after a step of the time map."""
 CELLS = (600, 200)
 """Points of a cloud that share one of so many cells (across, up) lie on each other: one is kept."""
 
@@ -46,7 +48,7 @@ class Series:
 
     ``name``: in the legend; curves of one name are switched together. ``half_width`` (k,): ± of each value.
     ``after_gap`` (k,): True where values are missing before a point; over time None: after each step of more than
-    ``GAP`` medians.
+    ``GAP`` or less than ``SQUEEZED`` medians.
     """
 
     name: str
@@ -63,13 +65,19 @@ class Series:
         steps = np.diff(self.x)
         if self.style != 'line' or len(steps) == 0:
             return self
-        wide = steps > GAP * np.nanmedian(steps) if self.after_gap is None else self.after_gap[1:]
-        at = np.flatnonzero(wide) + 1
+        apart = gaps_of(steps) if self.after_gap is None else self.after_gap[1:]
+        at = np.flatnonzero(apart) + 1
         if len(at) == 0:
             return self
         half_width = None if self.half_width is None else np.insert(self.half_width, at, np.nan)
         x = np.insert(self.x, at, 0.5 * (self.x[at - 1] + self.x[at]))
         return replace(self, x=x, y=np.insert(self.y, at, np.nan), half_width=half_width, after_gap=None)
+
+
+def gaps_of(steps: FloatArray) -> npt.NDArray[np.bool_]:
+    """Where ``steps`` (k,) of time are more than ``GAP`` or less than ``SQUEEZED`` medians: (k,)."""
+    usual = np.nanmedian(steps)
+    return (steps > GAP * usual) | (steps < SQUEEZED * usual)
 
 
 class Rule(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
-from psd_deflection.base.charts import Chart, Colour, Panel, Series, TimeAxis
+from psd_deflection.base.charts import Chart, Colour, Panel, Series, TimeAxis, gaps_of
 from psd_deflection.records import FloatArray, Mark, Moment, channel_names
 
 TONES: tuple[Colour, ...] = ('blue', 'orange', 'green')
@@ -26,6 +26,8 @@ def samples_chart(samples: npt.NDArray[np.void], psds: int, marks: Sequence[Mome
     """x, y and sum of each PSD, V, over time, with the marks. ``samples``: of ``Recording.samples``."""
     along = TimeAxis(FROM_FIRST, marks)
     after_gap = np.diff(samples['seq'], prepend=samples['seq'][:1]) > 1
+    if len(samples) > 1:
+        after_gap[1:] |= gaps_of(np.diff(samples['t']))
     panels = []
     for i, name in enumerate(channel_names(psds)):
         values = samples[name].astype(np.float64)

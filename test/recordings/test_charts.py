@@ -39,6 +39,18 @@ def test_estimates_are_drawn_with_their_interval() -> None:
     assert estimates_chart(np.array([0.5]), pose, None, 'a', ()).panels[0].series[0].half_width is None
 
 
+def test_no_line_is_drawn_over_a_step_of_the_time_map() -> None:
+    """Twenty samples, ten of which the stamps are raised by 1 ns each, ten right ones, and a leap by 5 ms."""
+    samples = np.zeros(50, sample_dtype(2))
+    samples['seq'] = np.arange(50)
+    steps = np.repeat([1e-3, 1e-9, 1e-3], [20, 10, 20])
+    steps[40] = 5e-3
+    samples['t'] = t = np.cumsum(steps)
+    (curve,) = samples_chart(samples, 2, ()).panels[0].curves
+    drawn = [span for span in _spans(curve.x, curve.y) if span[0] < span[1]]
+    assert drawn == [(t[0], t[19]), (t[29], t[39]), (t[40], t[49])]
+
+
 @pytest.mark.parametrize('part', ['samples', 'estimates'])
 def test_a_recording_draws_itself(part: str) -> None:
     recording = psd_deflection.open(ROOT / 'bags' / 'clean').crop(1.0, 2.0)
