@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The rooms: their number, what their lines allow, and that no class name stands for two things."""
+"""The rooms: what their lines allow, which tests should notice their mutants, and no class name for two things."""
 
 from __future__ import annotations
 
@@ -14,15 +14,13 @@ from pathlib import Path
 import pytest
 
 from tools.allow_contract import broken_by
+from tools.mutants_by_hand import KINDS, hand_made
 from tools.rooms import large_functions, private_names
+from tools.tiers import ROOMS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).parents[1]
 PURE = {'math', 'numpy'}
-LINES = {
-    'psd_deflection': ['warnings'],
-    'psd_deflection.measure': [],
-    'psd_deflection.run': ['threading'],
-}
+LINES = {'psd_deflection': ['warnings'], 'psd_deflection.measure': [], 'psd_deflection.run': ['threading']}
 NO_ROOM = 'no line for the room psd_deflection.attic'
 FOREIGN = ('concurrent', 'multiprocessing', 'trajectory_msgs', 'aiohttp', 'urllib', 'threading')
 AS_IT_IS = {
@@ -82,3 +80,32 @@ def test_private_names_are_counted(tmp_path: Path) -> None:
 
 def test_no_function_is_large() -> None:
     assert large_functions(ROOT) == {}
+
+
+def test_each_lies_in_a_room_whose_tests_should_notice() -> None:
+    rooms = [path for room in ROOMS.values() for path in room.code]
+    for m in hand_made():
+        assert any(m.file == path or m.file.startswith(f'{path}/') for path in rooms), m.file
+    for room in ROOMS.values():
+        for path in (*room.code, *room.leave):
+            assert (ROOT / path).exists(), path
+
+
+def test_each_room_has_quick_tests_in_each_of_its_files() -> None:
+    for room in ROOMS.values():
+        for path in map(ROOT.joinpath, (*room.tests, *room.slow)):
+            files = list(path.rglob('test_*.py')) or [path]
+            slow = ['pytestmark = pytest.mark.slow' in file.read_text() for file in files]
+            assert not all(slow) or str(path.relative_to(ROOT)) not in room.tests, path
+
+
+def test_each_mutant_made_by_hand_changes_one_line_and_can_run() -> None:
+    every = hand_made()
+    assert {m.kind for m in every} == set(KINDS)
+    assert len(set(every)) == len(every)
+    for m in every:
+        text = (ROOT / m.file).read_text()
+        changed = m.code(text)
+        ast.parse(changed)
+        lines = [(a, b) for a, b in zip(text.splitlines(), changed.splitlines(), strict=True) if a != b]
+        assert [(a.strip(), b.strip()) for a, b in lines] == [(m.was, m.made)]

@@ -1,19 +1,22 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a page gets of a declared chart: its arrays, thinned, each once; and the policy of the page."""
+"""A declared chart on a page and as a figure of matplotlib; what is shown of the axes of the tip."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 import json
+import math
 import re
 from typing import Any
 
 import numpy as np
 import pytest
 
+from psd_deflection.base.axes import ranges
 from psd_deflection.base.charts import BUCKETS, Chart, Panel, Rule, Series, drawn
+from psd_deflection.base.figures import figure_of
 from psd_deflection.base.pages import page, table
 from psd_deflection.records import FloatArray
 
@@ -120,3 +123,31 @@ def test_page_policy_allows_only_its_own_scripts() -> None:
     allowed = ' '.join(f"'sha256-{digest}'" for digest in digests)
     assert policy[1] == f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
     assert not re.search(r'^(import|export) ', scripts[1], flags=re.M)
+
+
+X = np.array([1.0, 2.0, 4.0])
+
+
+def test_every_curve_is_in_its_panel() -> None:
+    above = Panel((Series('a', X, X**2, 'red'), Series('b', X, X, 'blue', 'points')), 't / s', 'x / µm', y_range=(0, 9))
+    below = Panel((Series('', X, -X, 'text', 'rings'),), 't / s', 'y / µm', rules=[Rule(3.0, 'here')])
+    first, second = figure_of(Chart('words', (above, below))).axes
+    assert [np.asarray(line.get_ydata()).tolist() for line in first.lines] == [[1, 4, 16], [1, 2, 4]]
+    assert first.get_ylim() == (0, 9)
+    legend = first.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ['a', 'b']
+    # The axis of time is named once.
+    assert (first.get_xlabel(), second.get_xlabel(), second.get_ylabel()) == ('', 't / s', 'y / µm')
+    assert second.get_legend() is None
+    assert np.asarray(second.lines[1].get_xdata()).tolist() == [3.0, 3.0]
+    assert [text.get_text().strip() for text in second.texts] == ['here']
+
+
+def test_pose_ranges_are_in_um_and_millidegrees() -> None:
+    poses = np.array([[1e-6, -2e-3, math.radians(0.5)], [3e-6, math.nan, math.radians(-0.25)], [2e-6, 1e-3, 0.0]])
+    assert ranges(poses) == [
+        ('ΔX', '+1.00 … +3.00 µm'),
+        ('ΔY', '-2000.00 … +1000.00 µm'),
+        ('θ', '-250.00 … +500.00 mdeg'),
+    ]

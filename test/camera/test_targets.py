@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,7 +14,11 @@ import numpy as np
 import pytest
 
 from blind.render import Pose, Scene, board, developed
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera import aruco, boards
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.boards import Board
+from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.kinds import TARGETS, target_class
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.print_target import printed
@@ -100,3 +106,140 @@ class Cross(Target):
 
     def drawing(self) -> Drawing:
         return Drawing((0.05, 0.05), discs=((0.0, 0.0, 0.01),))
+
+
+SMALL = Scene(width=400, height=320, focal=1000.0, centre=(195.0, 162.0), distance=0.25, distortion=(-0.1, 0.05))
+BOARD = CameraSettings(
+    target='charuco', columns=5, rows=5, matrix=tuple(SMALL.matrix), distortion=(-0.1, 0.05, 0.0, 0.0)
+)
+TAGS = replace(BOARD, target='apriltag', columns=3, rows=3, marker=0.014, gap=0.005)
+
+
+def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Generator) -> Any:
+    target = target_of(settings)
+    assert isinstance(target, Board)
+    pixels = (round(target.size[0] * 2e4), round(target.size[1] * 2e4))
+    texture = aruco.picture(target.board, pixels) / 255.0
+    return developed(scene, board(scene, pose, texture, target.size), rng)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('view', ['outside', 'base'])
+@pytest.mark.parametrize('settings', [BOARD, TAGS], ids=['charuco', 'apriltag'])
+def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
+    scene, rng = replace(SMALL, view=view, turn=0.1), np.random.default_rng(3)
+    settings = replace(settings, view=view, rest_frames=1)
+    reference = CameraReference(settings, target_of)
+    reference.take(0, shot(scene, settings, Pose(), rng))
+    pose = Pose(2e-3, -1e-3, math.radians(100), 0.02, -0.01)
+    (answer,) = reference.take(1, shot(scene, settings, pose, rng))
+    assert answer.status is Status.OK
+    assert answer.covariance is not None
+    off = np.array([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
+    assert np.all(np.abs(off) < [10e-6, 10e-6, math.radians(0.02)]), off
+    assert np.all(np.abs(off) < 5.0 * np.sqrt(np.diag(answer.covariance)))
+
+
+def test_board_noise_is_pose_residual_over_freedom() -> None:
+    """A pose takes six of the independent values; the residuals are those of OpenCV's projection."""
+    board = target_of(BOARD)
+    assert isinstance(board, Board)
+    image = shot(SMALL, BOARD, Pose(0.0, 0.0, 0.1, 0.02, -0.01), np.random.default_rng(3))
+    matrix, distortion = np.array(SMALL.matrix).reshape(3, 3), np.array(BOARD.distortion)
+    found = board.locate(image, image, Lens(matrix, distortion), 255.0)
+    # All of the corners of 5 x 5 squares.
+    assert len(found.points) == 16
+    assert found.residuals == 32
+    apart = BOARD.square * (np.arange(4) - 1.5)
+    corners = np.array([[x, y, 0.0] for x in apart for y in apart])
+    turn, _ = cv2.Rodrigues(found.rotation)
+    observed, _ = cv2.projectPoints(corners, turn, found.place, matrix, distortion)
+    away = np.linalg.norm(observed - found.points, axis=2)
+    # Each corner has its own, much nearer than the next.
+    assert sorted(away.argmin(axis=0).tolist()) == list(range(16))
+    left = float(np.sum(away.min(axis=0) ** 2))
+    assert found.noise**2 == pytest.approx(left / (32 - 6), rel=0.005)
+
+
+def test_half_a_board_and_none_are_rejected() -> None:
+    rng = np.random.default_rng(3)
+    image = shot(SMALL, BOARD, Pose(), rng)
+    hidden = image.copy()
+    hidden[:, 150:] = 128
+    for picture, status in ((hidden, Status.HIDDEN), (np.full_like(image, 90), Status.MISSING)):
+        reference = CameraReference(BOARD, target_of)
+        assert [a.status for a in reference.take(0, picture)] == [status]
+
+
+def test_the_lens_is_found_again() -> None:
+    scene, rng = replace(SMALL, distance=0.16, distortion=(-0.15, 0.05)), np.random.default_rng(7)
+    tilts = [(0.4, 0.0), (-0.4, 0.1), (0.0, 0.4), (0.1, -0.4), (0.3, 0.3), (-0.3, -0.3)]
+    images = [(f'{i}.png', shot(scene, BOARD, Pose(phi=a, omega=b), rng)) for i, (a, b) in enumerate(tilts)]
+    found = calibrated(BOARD, [*images, ('broken.png', None)])
+    assert found.used == len(tilts)
+    assert found.excluded == [('broken.png', 'unreadable image')]
+    assert found.matrix[0, 0] == pytest.approx(scene.focal, rel=0.01)
+    lens, true = (
+        Lens(found.matrix, found.distortion),
+        Lens(np.array(scene.matrix).reshape(3, 3), np.array([-0.15, 0.05, 0, 0])),
+    )
+    corner = np.array([[60.0, 60.0], [340.0, 260.0]])
+    assert np.diff(lens.rays(corner), axis=0) == pytest.approx(np.diff(true.rays(corner), axis=0), rel=0.01)
+    with pytest.raises(ConfigError, match='at least 5'):
+        calibrated(BOARD, images[:2])
+
+
+def test_opencv_agrees_about_distortion() -> None:
+    distortion = np.array([-0.2, 0.1, 0.001, -0.002, 0.05, 0.01, -0.02, 0.003])
+    matrix = np.array([[900.0, 0, 320], [0, 910, 240], [0, 0, 1]])
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 2))
+    theirs, _ = cv2.projectPoints(np.column_stack([points, np.ones(50)]), np.zeros(3), np.zeros(3), matrix, distortion)
+    lens = Lens(matrix, distortion)
+    assert lens.pixels(points) == pytest.approx(theirs[:, 0], abs=1e-9)
+    assert lens.rays(theirs[:, 0]) == pytest.approx(points, abs=1e-11)
+
+
+def test_the_printed_discs_have_their_size() -> None:
+    target = target_of(CameraSettings(spacing=0.02, radius=0.006))
+    paper = cv2.imdecode(np.frombuffer(printed(target, 'png'), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert paper is not None
+    middle = paper.shape[1] // 2
+    edges = np.flatnonzero(np.diff((paper[:, middle] > 128).astype(int)))
+    # White, black, three discs, white.
+    rims = edges[1:7] / 600 * 0.0254
+    assert np.diff(rims)[::2] == pytest.approx([0.012] * 3, abs=1e-4)
+    assert np.diff(rims[::2]) == pytest.approx([0.02] * 2, abs=1e-4)
+    assert target.describe() == ['target.kind: circles', 'target.spacing: 0.02', 'target.radius: 0.006']
+
+
+@pytest.mark.parametrize('settings', [BOARD, TAGS], ids=['charuco', 'apriltag'])
+def test_a_printed_board_is_read_again(settings: CameraSettings) -> None:
+    target = target_of(settings)
+    paper = cv2.imdecode(np.frombuffer(printed(target, 'png'), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert paper is not None
+    small = cv2.resize(paper, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+    reference = CameraReference(replace(settings, matrix=(), distortion=()), target_of)
+    reference.take(0, small)
+    (answer,) = reference.finish()
+    assert answer.status is Status.OK
+    assert printed(target, 'pdf').startswith(b'%PDF')
+
+
+@pytest.mark.parametrize('kind', ['charuco', 'apriltag'])
+@pytest.mark.parametrize(
+    ('version', 'there'),
+    [
+        ('4.6.0', {}),  # Of PyPI: without opencv_contrib.
+        ('4.5.4', {'CharucoBoard_create': None}),  # Its boards have other axes.
+    ],
+)
+def test_an_opencv_without_boards_is_rejected_with_the_fix(
+    kind: str, version: str, there: dict[str, None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = SimpleNamespace(__version__=version, aruco=SimpleNamespace(DICT_4X4_50=0, **there))
+    monkeypatch.setattr(boards, 'opencv', lambda: old)
+    monkeypatch.setattr(aruco, 'opencv', lambda: old)
+    with pytest.raises(
+        ConfigError, match=rf'OpenCV {version} has no boards; target.kind {kind} .* virtual environment'
+    ):
+        target_of(CameraSettings(target=kind))

@@ -1,12 +1,14 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``psd-deflection budget``: what it prints, draws and rejects."""
+"""``budget``, ``design`` and ``certificate``: what they print, draw and reject; the tables alone give every U."""
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import re
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +17,12 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.studies.budget.evaluate import CAUSES
 from psd_deflection.studies.budget.inputs import INPUTS
+from psd_deflection.studies.thesis.scaling import ERRATA_B1, ERRATA_B2, MATERIALS
 
-pytestmark = pytest.mark.slow
-
-RIG = str(Path(__file__).parent.parent.parent / 'config' / 'thesis_rig.yaml')
+RIG = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
 
 
+@pytest.mark.slow
 def test_the_page_has_a_bar_for_every_cause_and_the_same_numbers(tmp_path: Path) -> None:
     assert main(['budget', '--params-file', RIG, '--out', str(tmp_path)]) == 0
     terms = json.loads((tmp_path / 'budget.json').read_text())['terms']
@@ -45,6 +47,7 @@ link: {length: 0.8, outer_radius: 0.006, inner_radius: 0.0045, youngs_modulus: 2
 """
 
 
+@pytest.mark.slow
 def test_a_rig_without_room_says_which_dot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'rig.yaml'
     path.write_text('/**:\n  ros__parameters:\n    psd_1: {active_area: [0.004, 0.004], zero: [0.0, 0.003]}\n')
@@ -52,6 +55,7 @@ def test_a_rig_without_room_says_which_dot(tmp_path: Path, capsys: pytest.Captur
     assert 'psd_1 would lie at y = 3.00 mm, outside its ±2 mm' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_json_has_the_figures_in_si(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / 'chart.svg'
     arguments = ['--json', '--out', str(out), '--method', 'beam', '--load', '1', '-2', '0.5', '--monte-carlo', '100']
@@ -68,6 +72,7 @@ def test_json_has_the_figures_in_si(capsys: pytest.CaptureFixture[str], tmp_path
     assert out.read_text(encoding='utf-8').startswith('<?xml')
 
 
+@pytest.mark.slow
 def test_everything_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['budget', '--explain', '--set', 'pointing_drift=2e-6']) == 0
     out = capsys.readouterr().out
@@ -80,6 +85,7 @@ def test_everything_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
         assert entry.source in out
 
 
+@pytest.mark.slow
 def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    solver: wls\n')
@@ -87,25 +93,214 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
     assert json.loads(capsys.readouterr().out)['method'] == 'wls'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('arguments', 'status', 'message'),
     [
-        (['--set', 'nothing'], 2, 'NAME=VALUE'),
-        (['--set', 'nothing=1'], 2, 'no such input'),
-        (['--monte-carlo', '1'], 2, '--monte-carlo'),
-        (['--monte-carlo', '1000', '--seed', '-1'], 2, '--seed'),
-        (['--load', 'nan', '0', '0'], 2, 'must be finite'),
-        (['--load', '0', '-500', '0'], 2, 'take a smaller load'),
-        (['--load', '1e300', '0', '0'], 2, 'than the link is long'),
-        (['--out', 'budget.txt'], 2, '.png, .svg or .pdf'),
-        (['--inputs', 'absent.yaml'], 3, 'absent.yaml'),
-        (['--params-file', 'absent.yaml'], 3, 'absent.yaml'),
+        (['budget', '--set', 'nothing'], 2, 'NAME=VALUE'),
+        (['budget', '--set', 'nothing=1'], 2, 'no such input'),
+        (['budget', '--monte-carlo', '1'], 2, '--monte-carlo'),
+        (['budget', '--monte-carlo', '1000', '--seed', '-1'], 2, '--seed'),
+        (['budget', '--load', 'nan', '0', '0'], 2, 'must be finite'),
+        (['budget', '--load', '0', '-500', '0'], 2, 'take a smaller load'),
+        (['budget', '--load', '1e300', '0', '0'], 2, 'than the link is long'),
+        (['budget', '--out', 'budget.txt'], 2, '.png, .svg or .pdf'),
+        (['budget', '--inputs', 'absent.yaml'], 3, 'absent.yaml'),
+        (['budget', '--params-file', 'absent.yaml'], 3, 'absent.yaml'),
+        (['design', '--params-file', RIG, '--sigma', '0'], 2, '--sigma'),
+        (['design', '--params-file', RIG, '--radius', '-1'], 2, '--radius'),
+        (['design', '--params-file', RIG, '--out', 'plan.txt'], 2, '.png, .svg or .pdf'),
+        (['design', '--params-file', RIG, '--out', 'no/such/folder/plan.png'], 4, 'cannot be written'),
     ],
 )
 def test_bad_input_is_rejected_in_one_line(
     arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(['budget', *arguments]) == status
+    assert main(arguments) == status
     error = capsys.readouterr().err
     assert message in error
     assert error.count('\n') == 1
+
+
+def test_both_tables_are_printed_with_every_erratum(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['design']) == 0
+    out = capsys.readouterr().out
+    assert '113.5 (113.6)' in out
+    assert '0.00267 (0.00268)' in out
+    for reason in (*ERRATA_B1.values(), *ERRATA_B2.values()):
+        assert reason in out
+    for material in MATERIALS:
+        assert material.name in out
+
+
+def test_a_rigs_placement_is_compared(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['design', '--params-file', RIG, '--sigma', '2e-6']) == 0
+    out = capsys.readouterr().out
+    rows = {line.split('  ')[0]: line.split() for line in reversed(out.splitlines())}
+    assert rows['this rig'][-5:] == ['1.630', '1.828', '1.328', '2.451', '16.446']
+    assert rows['best in the room'][-5:] == ['1.414', '1.414', '0.810', '1.000', '10.000']
+    assert 'ΔX 1.15, ΔY 1.29, θ 1.64 times smaller' in out
+    assert rows['this rig, two sensors'][-1] == 'unseen'
+
+
+def test_programs_get_the_same_placements_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['design', '--params-file', RIG, '--sigma', '2e-6', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    own, _, best = found['placements']
+    assert own['centers'] == [[0.0, 0.07], [-0.1, 0.0]]
+    assert own['sd'] == pytest.approx({'dx': 1.630e-6, 'dy': 1.828e-6, 'theta': math.radians(1.328e-3)}, rel=1e-3)
+    assert best['sd'] == pytest.approx({'dx': 1.414e-6, 'dy': 1.414e-6, 'theta': math.radians(0.810e-3)}, rel=1e-3)
+
+
+def test_sensors_on_one_spot_are_unseen_not_a_crash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    psd_2:\n      center: [0.0, 0.07]\n')
+    assert main(['design', '--params-file', str(rig)]) == 0
+    assert 'unseen' in capsys.readouterr().out
+    assert main(['design', '--params-file', str(rig), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['placements'][0]['sd'] == {'dx': None, 'dy': None, 'theta': None}
+
+
+@pytest.mark.parametrize('name', ['plan.png', 'plan.svg'])
+def test_the_drawing_is_written(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / name
+    arguments = ['--keep-out', '0.03', '--box', '-0.12', '0', '0.12', '0.12', '--out', str(out)]
+    assert main(['design', '--params-file', RIG, *arguments]) == 0
+    assert str(out) in capsys.readouterr().out
+    assert out.read_bytes()[:5] in (b'\x89PNG\r', b'<?xml')
+
+
+LOADS = 'steps:0,0,0;0,-40,-20;40,0,15;-40,30,0;0,40,20;-40,-30,-15;20,0,-20;0,0,0:1'
+WRONG = ('--effect', 'sensor_rotation,psd=2,angle=0.012', '--effect', 'sensor_gain,psd=1,x=0.01,y=-0.005')
+AXES = ('dx', 'dy', 'theta')
+
+
+@pytest.fixture(scope='module')
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('calibrated')
+    recording = str(folder / 'run.csv')
+    simulate = ['simulate', '--out', recording, '--reference-noise', '1e-5,5e-4', '--loads', LOADS]
+    assert main([*simulate, *WRONG]) == 0
+    assert main(['calibrate', recording, '--params-file', RIG, '--out', str(folder / 'new'), '--quiet']) == 0
+    return folder / 'new'
+
+
+@pytest.fixture(scope='module')
+def certified(calibrated: Path) -> Path:
+    out = calibrated.parent / 'certificate'
+    fields = calibrated.parent / 'fields.yaml'
+    fields.write_text('number: A-17\npsd_1: S1880 no. 4\nreference_certificate: 12345\npressure: 1013\n')
+    more = ['--fields', str(fields), '--limit', '1e-4', '1e-4', '2e-3', '--set', 'reference_scale=2e-5']
+    assert main(['certificate', str(calibrated), '--out', str(out), *more]) == 0
+    return out
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline='', encoding='utf-8') as file:
+        return list(csv.DictReader(file))
+
+
+def _student(probability: float, freedom: float) -> float:
+    """The quantile by summing the density up (Simpson) and halving the interval; no library of statistics."""
+    if math.isinf(freedom):
+        return 1.959963984540054
+    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(freedom * math.pi)
+
+    def share(k: float) -> float:
+        n = 2000
+        values = [(1 + (k * i / n) ** 2 / freedom) ** (-(freedom + 1) / 2) for i in range(n + 1)]
+        return float(scale * k / n / 3 * (values[0] + values[-1] + 4 * sum(values[1::2]) + 2 * sum(values[2:-1:2])) * 2)
+
+    low, high = 0.0, 20.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if share(middle) < probability else (low, middle)
+    return low
+
+
+@pytest.mark.slow
+def test_the_tables_give_every_u_again(certified: Path) -> None:
+    """As a person does in a spreadsheet: from inputs.csv and correlations.csv alone."""
+    inputs = _rows(certified / 'inputs.csv')
+    correlations = {row['']: row for row in _rows(certified / 'correlations.csv')}
+    results = _rows(certified / 'results.csv')
+    assert len(results) == 7
+    for result in results:
+        for axis in AXES:
+            variances: dict[str, float] = defaultdict(float)
+            freedom = {row['cause']: float(row['nu']) for row in inputs}
+            g = {
+                (row['cause'], row['parameter']): float(row['u']) * float(row[f'c_{axis}_{result["pose"]}'])
+                for row in inputs
+            }
+            for (cause, p), a in g.items():
+                if cause != 'calibration':
+                    variances[cause] += a * a
+                    continue
+                for q, one in correlations.items():
+                    variances[cause] += a * float(one[p]) * g[cause, q]
+            total = math.fsum(variances.values())
+            doubt = math.fsum(v * v / freedom[cause] for cause, v in variances.items())
+            effective = math.floor(total**2 / doubt)
+            k = _student(0.95, effective)
+            assert float(result[f'u_c_{axis}']) == pytest.approx(math.sqrt(total), rel=1e-9)
+            assert float(result[f'nu_eff_{axis}']) == effective
+            assert float(result[f'U_{axis}']) == pytest.approx(k * math.sqrt(total), rel=1e-6)
+
+
+def test_the_page_has_the_same_numbers(certified: Path) -> None:
+    page = (certified / 'certificate.html').read_text(encoding='utf-8')
+    # What is shown to six digits in the page's table of inputs is the table's number.
+    for row in _rows(certified / 'inputs.csv'):
+        assert f'<td>{float(row["u"]):.6g}</td>' in page
+    largest = _rows(certified / 'results.csv')[1]
+    for axis, scale in zip(AXES, (1e6, 1e6, math.degrees(1e3)), strict=True):
+        assert f'<td>{scale * float(largest[f"U_{axis}"]):.3f}</td>' in page
+    for words in ('A-17', 'S1880 no. 4', '12345', '1013', 'date, signature', 'guard band U', '. . . .'):
+        assert words in page
+    assert re.search(r'motion slower than 45 Hz', page)
+
+
+def test_as_found_is_what_the_old_rig_file_measures(calibrated: Path) -> None:
+    """What the nominal rig file says of a held load, once it has come to rest, less the truth: by replay."""
+    folder = calibrated.parent
+    held, estimates = str(folder / 'held.csv'), folder / 'held_out.csv'
+    assert main(['simulate', '--out', held, '--loads', 'steps:0,0,0;0,-40,0:5', *WRONG]) == 0
+    assert main(['replay', held, '--params-file', RIG, '--out', str(estimates)]) == 0
+    last = _rows(estimates)[-50:]
+    dy = -40.0 * 0.585**3 / (3.0 * 69e9 * 2.171272689e-8)
+    assert main(['certificate', str(calibrated), '--out', str(folder / 'at'), '--pose', '0', str(dy), '0']) == 0
+    row = _rows(folder / 'at' / 'results.csv')[0]
+    # The calibration itself is uncertain by two micrometres and two millidegrees.
+    for axis, tolerance in zip(AXES, (5e-6, 5e-6, 1e-4), strict=True):
+        error = sum(float(block[axis]) for block in last) / len(last) - float(row[axis])
+        assert float(row[f'as_found_{axis}']) == pytest.approx(error, abs=tolerance)
+    assert abs(float(row['as_found_dx'])) > 1e-5
+
+
+@pytest.mark.parametrize(
+    ('more', 'status', 'words'),
+    [
+        (['--pose', '0', '-0.5', '0'], 2, 'outside its'),
+        (['--pose', 'nan', '0', '0'], 2, 'finite'),
+        (['--limit', 'inf', '0', '0'], 2, 'finite'),
+        (['--set', 'reference_scal=1'], 2, 'did you mean reference_scale'),
+        (['--fields', 'absent.yaml'], 3, 'absent.yaml'),
+    ],
+)
+def test_certificate_rejects_bad_input_in_one_line(
+    more: list[str], status: int, words: str, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['certificate', str(calibrated), '--out', str(tmp_path), *more]) == status
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count('\n') == 1
+
+
+def test_a_field_that_there_is_not_is_named(
+    calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fields = tmp_path / 'fields.yaml'
+    fields.write_text('psd1: S1880\n')
+    assert main(['certificate', str(calibrated), '--out', str(tmp_path), '--fields', str(fields)]) == 3
+    assert 'psd1: no such field; did you mean psd_1' in capsys.readouterr().err

@@ -11,22 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+from psd_deflection.arms.chains.chain import TipDeflection
+from psd_deflection.arms.chains.chain_file import ChainSettings, read_chain
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.ros.chain import chain_transforms
+from psd_deflection.run.chain import Composed
+from test.ros.conftest import BLOCK_NS, WARNINGS, stamp
+from tools.program import PSD_DEFLECTION, ROOT, Program
 
 pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
-
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
-
-from psd_deflection.arms.chains.chain import TipDeflection  # noqa: E402
-from psd_deflection.arms.chains.chain_file import ChainSettings, read_chain  # noqa: E402
-from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
-from psd_deflection.ros.chain import chain_transforms  # noqa: E402
-from psd_deflection.run.chain import Composed  # noqa: E402
-from test.ros.conftest import BLOCK_NS, WARNINGS, stamp  # noqa: E402
-from tools.program import PSD_DEFLECTION, ROOT, Program  # noqa: E402
 
 EXAMPLE = ROOT / 'config' / 'two_links.yaml'
 

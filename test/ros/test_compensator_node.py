@@ -18,26 +18,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64, String
+from std_srvs.srv import SetBool
+
+from bench.campaign.graph import BREAKS, URDF
+from bench.campaign.hold import WITHIN
+from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful
+from test.ros.conftest import WARNINGS
+from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import SetParameters  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import Bool, Float64, String  # noqa: E402
-from std_srvs.srv import SetBool  # noqa: E402
-
-from bench.campaign.graph import BREAKS, URDF  # noqa: E402
-from bench.campaign.hold import WITHIN  # noqa: E402
-from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful  # noqa: E402
-from test.ros.conftest import WARNINGS  # noqa: E402
-from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 STALE = '0.8'
 """s. On a busy machine this process is late too; test/arms/compensation has the default of 0.08 s."""

@@ -22,35 +22,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytestmark = pytest.mark.ros
-rclpy = pytest.importorskip('rclpy')
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, WrenchStamped  # noqa: E402
-from lifecycle_msgs.msg import State, Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
-from rcl_interfaces.msg import Log, ParameterValue  # noqa: E402
-from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
-from rcl_interfaces.srv import (  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, WrenchStamped
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Log, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import (
     DescribeParameters,
     GetParameters,
     ListParameters,
     SetParameters,
 )
-from rclpy.action import ActionClient, get_action_server_names_and_types_by_node  # noqa: E402
-from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image, JointState  # noqa: E402
-from std_msgs.msg import Float64MultiArray, String  # noqa: E402
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
+from rclpy.action import ActionClient, get_action_server_names_and_types_by_node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from blind.render import Pose, Scene, photograph  # noqa: E402
-from psd_deflection.ros.topics import FOLLOW, HEARD, PUBLISHED, SERVED  # noqa: E402
-from test.ros.conftest import WARNINGS, Peer, stamp  # noqa: E402
-from tools.control_msgs import available  # noqa: E402
-from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
+from blind.render import Pose, Scene, photograph
+from psd_deflection.ros.topics import FOLLOW, HEARD, PUBLISHED, SERVED
+from test.ros.conftest import WARNINGS, Peer, stamp
+from tools.control_msgs import available
+from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
+
+pytestmark = pytest.mark.ros
 
 ROS = ROOT / 'psd_deflection' / 'ros'
 NAMESPACE = '/left'

@@ -23,33 +23,31 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
-
-pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
-
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import (  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import (
     PointStamped,
     PoseStamped,
     PoseWithCovarianceStamped,
     Vector3Stamped,
     WrenchStamped,
 )
-from rcl_interfaces.msg import Log  # noqa: E402
-from rcl_interfaces.srv import GetParameters  # noqa: E402
-from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import PointCloud2  # noqa: E402
-from std_srvs.srv import SetBool  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
+from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool
+from visualization_msgs.msg import MarkerArray
 
-from msg_adapters import point_cloud2  # noqa: E402
-from psd_deflection.cli.main import main  # noqa: E402
-from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
-from psd_deflection.rig.declarations import PARAMETERS  # noqa: E402
-from test.ros.conftest import BLOCK_NS, HANGING_DISK, stamp  # noqa: E402
+from msg_adapters import point_cloud2
+from psd_deflection.cli.main import main
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.rig.declarations import PARAMETERS
+from test.ros.conftest import BLOCK_NS, HANGING_DISK, stamp
+
+pytestmark = pytest.mark.ros
 
 MS = 1_000_000
 

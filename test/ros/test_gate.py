@@ -4,23 +4,27 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any, cast
 
 import pytest
+import rclpy
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from bench.campaign.attacked import NODES
+from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery
+from psd_deflection.base.log import INFO, WARNING
+from psd_deflection.ros.endpoints import qos
+from psd_deflection.ros.gate import MOST_A_SECOND, InputGate
+from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic
+from test.ros.test_conformance import nodes_of_setup
+from tools.program import ROOT, WAIT_S
 
 pytestmark = pytest.mark.ros
-rclpy = pytest.importorskip('rclpy')
-
-from rclpy.event_handler import PublisherEventCallbacks  # noqa: E402
-from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-
-from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery  # noqa: E402
-from psd_deflection.base.log import INFO, WARNING  # noqa: E402
-from psd_deflection.ros.endpoints import qos  # noqa: E402
-from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
-from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic  # noqa: E402
 
 TOPIC = '/said'
 KEPT = Delivery(50)
@@ -86,10 +90,7 @@ def test_good_ones_are_taken_and_others_counted_and_reported(
 
     peer.until(sent, 'the messages')
     assert set(gated.heard) == {'good'}
-    assert set(gated.logged) == {
-        f'{TOPIC}: rejected: empty',
-        f'{TOPIC}: rejected: 2009 bytes: must be at most 1000',
-    }
+    assert set(gated.logged) == {f'{TOPIC}: rejected: empty', f'{TOPIC}: rejected: 2009 bytes: must be at most 1000'}
     assert set(gated.levels) == {WARNING}
     count, why = gated.gate.values()
     assert count == (f'messages rejected: {TOPIC}', str(gated.gate.rejected[TOPIC]))
@@ -164,3 +165,28 @@ def test_unreliable_load_publisher_is_rejected_by_name(
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     peer.until(lambda: gated.gate.rejected[TOPIC] > 0, 'the publisher that is best effort')
     assert 'a publisher is best effort, and this has to be reliable' in gated.logged[0]
+
+
+ENDED = """
+import sys
+from bench.campaign.messages import main
+from psd_deflection.arms.inputs import KnownJoints
+def broken(*_):
+    raise RuntimeError('a defect')
+KnownJoints.notify = broken
+sys.exit(main())
+"""
+
+
+def test_every_node_is_attacked() -> None:
+    assert set(NODES) == set(nodes_of_setup())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('script', 'wanted'), [('', 0), (ENDED, 1)])
+def test_a_node_that_holds_and_one_that_ends(domain: int, script: str, wanted: int) -> None:
+    command = ['-c', script] if script else ['-m', 'bench.campaign.messages']
+    words = [sys.executable, *command, '300', '--node', 'shaper', '--dds', '0']
+    ended = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert ended.returncode == wanted, ended.stderr[-3000:]
+    assert ('EndedError' in ended.stderr) == bool(script)

@@ -6,40 +6,36 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Log, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
 
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import null_log
+from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.ros import estimator, node
+from psd_deflection.ros.running import OTHER_CHOICES, TRANSPORTS, ros
+from test.heard import WAIT_S
+from test.ros.conftest import PATIENT, stamp
 
 pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: E402
-from lifecycle_msgs.msg import State, Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
-from rcl_interfaces.msg import (  # noqa: E402
-    Log,
-    ParameterValue,
-)
-from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
-from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically  # noqa: E402
-from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
-
-from psd_deflection.base.errors import ConfigError, DeviceError  # noqa: E402
-from psd_deflection.devices.serial_port import SerialPort  # noqa: E402
-from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
-from psd_deflection.ros import estimator, node  # noqa: E402
-from test.heard import WAIT_S  # noqa: E402
-from test.ros.conftest import PATIENT, stamp  # noqa: E402
 
 
 def change(peer: Any, transition: int) -> bool:
@@ -279,3 +275,26 @@ def test_a_rejection_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(node, '_ManagedNode', rejected)
     with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
         estimator.run(['--ros-args'], {}, null_log)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('shared_memory', [False, True])
+def test_a_process_that_is_killed_makes_no_other_deaf(
+    domain: int, monkeypatch: pytest.MonkeyPatch, shared_memory: bool
+) -> None:
+    for choice in OTHER_CHOICES:
+        monkeypatch.setenv(choice, '')
+        monkeypatch.delenv(choice)
+    with ros('one', [], shared_memory):
+        assert os.environ.get(TRANSPORTS) == (None if shared_memory else 'UDPv4')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('choice', OTHER_CHOICES)
+def test_the_choice_of_the_user_stays(domain: int, monkeypatch: pytest.MonkeyPatch, choice: str) -> None:
+    for one in OTHER_CHOICES:
+        monkeypatch.setenv(one, '')
+        monkeypatch.delenv(one)
+    monkeypatch.setenv(choice, 'SHM' if choice == TRANSPORTS else '')
+    with ros('one', []):
+        assert os.environ.get(TRANSPORTS) == ('SHM' if choice == TRANSPORTS else None)

@@ -12,24 +12,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionClient
+from rclpy.duration import Duration
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving
+from psd_deflection.ros.actions import GuardedServer
+from test.ros.conftest import WARNINGS, Peer
+from tools.control_msgs import available
+from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
-rclpy = pytest.importorskip('rclpy')
-
-from action_msgs.msg import GoalStatus  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
-from rclpy.action import ActionClient  # noqa: E402
-from rclpy.duration import Duration  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
-
-from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving  # noqa: E402
-from psd_deflection.ros.actions import GuardedServer  # noqa: E402
-from test.ros.conftest import WARNINGS, Peer  # noqa: E402
-from tools.control_msgs import available  # noqa: E402
-from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 NAMES = ('shoulder', 'elbow')
 START = np.array([0.3, -0.2])

@@ -9,23 +9,21 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from bench.shapers import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played
+from psd_deflection.arms.compensation.trajectory import checked
+from test.ros.conftest import WARNINGS, stamp
+from tools.program import PSD_DEFLECTION, ROOT, Program
 
 pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
-
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
-from rclpy.duration import Duration  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
-
-from bench.shapers import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
-from psd_deflection.arms.compensation.trajectory import checked  # noqa: E402
-from test.ros.conftest import WARNINGS, stamp  # noqa: E402
-from tools.program import PSD_DEFLECTION, ROOT, Program  # noqa: E402
 
 ZVD = ('--frequency', str(FREQUENCY), '--damping-ratio', str(RATIO), '--shaper', 'zvd')
 URDF = ROOT / 'config' / 'two_links.urdf'

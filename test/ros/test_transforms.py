@@ -1,28 +1,37 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The tree of frames: complete, true to scale, and one for each rig."""
+"""What viewers are given: the tree of frames, latched markers and geometry, the robot's description."""
 
 from __future__ import annotations
 
 import importlib.util
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from visualization_msgs.msg import Marker, MarkerArray
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import null_log, texts
+from psd_deflection.records import BlockStatus, DeflectionEstimate, SpotMeans
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.ros.description import robot_description
+from psd_deflection.ros.markers import at_rest, moving
+from psd_deflection.ros.running import ros
+from psd_deflection.ros.sinks import topics_of
+from psd_deflection.ros.transforms import TransformPublisher, static_transforms, tip_transform
+from psd_deflection.run.processing import RecordSink
+from psd_deflection.run.signals import Signals, StopRequestedError
 
 pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
-
-from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-
-from psd_deflection.records import DeflectionEstimate  # noqa: E402
-from psd_deflection.rig.config import Rig, load_rig  # noqa: E402
-from psd_deflection.ros.sinks import topics_of  # noqa: E402
-from psd_deflection.ros.transforms import TransformPublisher, static_transforms, tip_transform  # noqa: E402
-from psd_deflection.run.processing import RecordSink  # noqa: E402
 
 AT_NS = 5_000_000_007
 
@@ -125,11 +134,141 @@ def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer:
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec('tf2_msgs') is not None, reason='tf2_msgs is there')
-def test_without_tf2_msgs_no_frames_are_reported(
-    start: Callable[..., Any],
-) -> None:
+def test_without_tf2_msgs_no_frames_are_reported(start: Callable[..., Any]) -> None:
     unasked = start()
     unasked.until('publishing on ROS')
     unasked.end()
     assert 'tf2_msgs' not in unasked.text
     start('--ros-args', '-p', 'publish_tf:=true').until(r'tf2_msgs is not installed: no frames on /tf \(publish_tf\)')
+
+
+RIG = load_rig()
+
+
+def spots(dots: tuple[float, float, float, float], sums: tuple[float, float] = (5.0, 5.0)) -> SpotMeans:
+    return SpotMeans(5_000_000_007, 0, dots, sums, np.zeros((4, 4)), 20, 0, BlockStatus.OK, '')
+
+
+def bent_by(dx: float = 0.0, dy: float = 0.0, theta: float = 0.0) -> DeflectionEstimate:
+    return DeflectionEstimate(0, 0, 'exact', dx, dy, theta, 0.0, 0.0, (0.0,) * 9, 0.0, True)
+
+
+def by_name(array: Any) -> dict[tuple[str, int], Any]:
+    return {(m.ns, m.id): m for m in array.markers}
+
+
+def test_at_rest_the_beams_meet_the_detectors() -> None:
+    rest, now = by_name(at_rest(RIG)), by_name(moving(RIG, bent_by(), spots((0.0, 0.0, 0.0, 0.0)), 10.0))
+    for number, psd in enumerate(RIG.psds, 1):
+        start, end = rest['beam', number].points
+        assert (start.x, start.y, start.z) == (*psd.center, 0.0)
+        assert (end.x, end.y, end.z) == (*psd.center, RIG.link.length)
+        place = now['psd', number].pose.position
+        assert (place.x, place.y, place.z) == (*psd.center, RIG.link.length)
+        dot = now['dot', number].pose.position
+        assert (dot.x, dot.y) == psd.center
+    stamp = now['plate', 0].header.stamp
+    assert (stamp.sec, stamp.nanosec) == (5, 7)
+
+
+def test_plate_follows_estimate_and_dot_stays_on_beam() -> None:
+    dx, dy, theta = 1e-4, -2e-4, 1e-3
+    bent = bent_by(dx, dy, theta)
+    c, s = math.cos(theta), math.sin(theta)
+    dots = []
+    for cx, cy in (psd.center for psd in RIG.psds):
+        x, y = cx - dx, cy - dy
+        # c + m = Rz(-theta)(l - d)
+        dots += [c * x + s * y - cx, -s * x + c * y - cy]
+    now = by_name(moving(RIG, bent, spots((dots[0], dots[1], dots[2], dots[3])), 1.0))
+    for number, psd in enumerate(RIG.psds, 1):
+        dot = now['dot', number].pose.position
+        assert (dot.x, dot.y) == pytest.approx(psd.center, abs=1e-12)
+    tip = now['link', 0].points[-1]
+    assert (tip.x, tip.y, tip.z) == pytest.approx((dx, dy, RIG.link.length))
+    assert now['psd', 1].pose.orientation.z == pytest.approx(math.sin(theta / 2))
+    far = by_name(moving(RIG, bent, spots((0.0, 0.0, 0.0, 0.0)), 10.0))
+    assert far['link', 0].points[-1].y == pytest.approx(10.0 * dy)
+
+
+def test_a_lost_dot_is_taken_away() -> None:
+    now = by_name(moving(RIG, bent_by(), spots((0.0, 0.0, math.nan, 0.0), (0.1, 5.0)), 10.0))
+    assert now['dot', 1].action == Marker.DELETE
+    assert now['dot', 2].action == Marker.DELETE
+    assert now['psd', 1].action == now['link', 0].action == Marker.ADD
+
+
+def test_markers_are_removed_without_an_estimate() -> None:
+    dots = spots((0.0, 0.0, 0.0, 0.0))
+    assert {m.action for m in moving(RIG, None, dots, 10.0).markers} == {Marker.DELETE}
+    # Nor is what was measured a while ago, when nothing comes any more; at rest stays.
+    assert {m.lifetime.sec for m in moving(RIG, bent_by(), dots, 10.0).markers} == {1}
+    assert {m.lifetime.sec for m in at_rest(RIG).markers} == {0}
+    slow = load_rig(overrides={'converter.sample_rate_hz': 10.0})
+    assert {m.lifetime.sec for m in moving(slow, bent_by(), dots, 10.0).markers} == {6}
+
+
+@pytest.mark.slow
+def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
+    start('--ros-args', '-p', 'markers:=true')
+    moves = peer.collect(MarkerArray, '/link_tip/markers')
+    peer.until(lambda: len(moves) >= 5, 'moving markers')
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    rest = peer.collect(MarkerArray, '/link_tip/markers_at_rest', latched)
+    peer.until(lambda: len(rest) >= 1, 'the latched markers')
+    assert {m.ns for m in rest[0].markers} == {'link_at_rest', 'laser', 'beam'}
+    assert {m.ns for m in moves[-1].markers} == {'link', 'plate', 'psd', 'dot'}
+    # The beams stand where the unloaded dots are.
+    put = Parameter('psd_1.zero', value=[0.001, 0.0]).to_parameter_msg()
+    peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
+    x = RIG.psds[0].center[0] + 0.001
+    peer.until(lambda: by_name(rest[-1])['beam', 1].points[0].x == pytest.approx(x), 'the beam at the new zero')
+
+
+def test_markers_are_in_prefixed_frames() -> None:
+    rig = load_rig(overrides={'frame_prefix': 'left_'})
+    drawn = (*at_rest(rig).markers, *moving(rig, bent_by(), spots((0.0, 0.0, 0.0, 0.0)), 10.0).markers)
+    assert {m.header.frame_id for m in drawn} == {'left_link_base'}
+
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+URDF = '<robot name="arm"/>'
+
+
+@pytest.fixture
+def signals(domain: int) -> Iterator[Signals]:
+    with ros('reader', ['--ros-args', '-r', '__ns:=/left']) as made:
+        yield made
+
+
+def test_what_was_published_before_is_heard(signals: Signals, peer: Any) -> None:
+    publisher = peer.node.create_publisher(String, '/left/robot_description', LATCHED)
+    publisher.publish(String(data=URDF))
+    logged: list[str] = []
+    assert robot_description(signals, texts(logged.append)) == URDF
+    assert logged == ['waiting for the robot on /left/robot_description']
+
+
+def test_if_nobody_publishes_it_the_error_says_so(signals: Signals) -> None:
+    with pytest.raises(ConfigError, match=r'^/left/robot_description: no description .* \(nobody publishes it\)'):
+        robot_description(signals, null_log, wait_s=0.0)
+
+
+def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
+    publisher = peer.node.create_publisher(String, '/left/robot_description', LATCHED)
+    publisher.publish(String(data=' '))
+    reported: list[str] = []
+
+    def clock() -> float:
+        """Its time is over once the rejection was said."""
+        return 10.0 * sum('rejected' in line for line in reported)
+
+    with pytest.raises(ConfigError, match='it is empty'):
+        robot_description(signals, texts(reported.append), wait_s=5.0, clock=clock)
+
+
+@pytest.mark.slow
+def test_a_signal_ends_the_waiting(signals: Signals) -> None:
+    signals.stop = True
+    with pytest.raises(StopRequestedError):
+        robot_description(signals, null_log)

@@ -1,16 +1,21 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The filter by itself: its covariances against sums over its own gains, and from when on what is told acts."""
+"""The filter: its tables beside a Kalman filter, covariances beside sums over its gains, loads acting unseen."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from blind import motion
 from psd_deflection.measure.motion.inertia import Inertia
-from psd_deflection.measure.motion.modal import Oscillator
+from psd_deflection.measure.motion.modal import BlockTables, Oscillator
 from psd_deflection.measure.motion.motion import ModalFilter, TipState
+from psd_deflection.measure.motion.unseen import LARGER, UnseenLoads
 from psd_deflection.records import BaseAcceleration, FloatArray
 
 N, MS = 20, 1_000_000
@@ -102,3 +107,139 @@ def test_a_base_that_is_reported_is_no_load_that_nobody_foresaw() -> None:
     # Private: what a load did unseen is added to variances 1e4 times as large.
     assert one._unseen is not None
     assert np.sqrt(one._unseen.variances[0].max()) < 1e-6
+
+
+MODE = Oscillator(14.0, 0.02)
+PERIOD = 1e-3
+
+
+def system(mode: Oscillator) -> FloatArray:
+    """dx/dt of (q, q'/w, u, r/w)."""
+    w = 2.0 * math.pi * mode.frequency
+    return np.array([[0.0, w, 0.0, 0.0], [-w, -2.0 * mode.damping_ratio * w, w, 0.0], [0.0, 0.0, 0.0, w], [0.0] * 4])
+
+
+@pytest.mark.parametrize('mode', [MODE, Oscillator(21.0, 0.0), Oscillator(3.0, 0.7)])
+@pytest.mark.parametrize('seconds', [0.0, 1e-3, 0.02, 0.5])
+def test_a_step_is_the_matrix_exponential(mode: Oscillator, seconds: float) -> None:
+    expected = expm(system(mode) * seconds)
+    np.testing.assert_allclose(mode.step(seconds), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        mode.pushed(np.array([seconds, -1.0])), [expected[:, 2:].T, np.zeros((2, 4))], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize('kind', [0, 1])
+def test_what_a_load_adds_is_the_integral_of_the_covariance(kind: int) -> None:
+    a = system(MODE)
+    rate = np.zeros((4, 4))
+    rate[2 + kind, 2 + kind] = 1.0
+
+    def grows(_: float, p: FloatArray) -> FloatArray:
+        p = p.reshape(4, 4)
+        return np.asarray(a @ p + p @ a.T + rate).ravel()
+
+    times = np.array([0.001, 0.02, 0.3])
+    expected = solve_ivp(grows, (0.0, 0.3), np.zeros(16), t_eval=times, rtol=1e-10, atol=1e-15).y.T.reshape(-1, 4, 4)
+    np.testing.assert_allclose(MODE.added_covariance(times)[:, kind], expected, rtol=1e-7, atol=1e-12)
+
+
+def by_samples(
+    y: FloatArray, here: list[int], x: FloatArray, p: FloatArray, rate: FloatArray, r: float
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """A Kalman filter, one sample after the other: state, covariance, NIS and log det of the innovations."""
+    phi = expm(system(MODE) * PERIOD)
+    added = np.einsum('c,cij->ij', rate, MODE.added_covariance(np.array([PERIOD]))[0])
+    squares = size = 0.0
+    for n in range(20):
+        x, p = phi @ x, phi @ p @ phi.T + added
+        if n in here:
+            s = float(p[0, 0]) + r
+            e = float(y[n] - x[0])
+            k = p[:, 0] / s
+            x, p = x + k * e, p - np.outer(k, p[0])
+            squares += e * e / s
+            size += math.log(s)
+    return x, p, squares, size
+
+
+@pytest.mark.parametrize('lost', [(), (0, 7, 8), tuple(range(1, 20))])
+def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(1)
+    rates, r = np.array([[[1e-9, 0.0], [1e-5, 0.0], [0.0, 1e-5]]]), 1e-12
+    tables = BlockTables((MODE,), 20, PERIOD)
+    tables.fill(r * np.eye(20)[None], rates)
+    here = [n for n in range(20) if n not in lost]
+    gains = tables.gains(np.array(here))
+    x = np.array([1e-3, -2e-3, 5e-4, 1e-4])
+    root = rng.normal(0.0, 1e-5, (4, 4))
+    p = root @ root.T
+    y = 1e-3 * rng.normal(1.0, 1e-2, 20)
+    for k, rate in enumerate(rates[0]):
+        expected = by_samples(y, here, x, p, rate, r)
+        miss = y[here] - gains.observed[0] @ x
+        posterior = np.linalg.inv(np.linalg.inv(p) + gains.information[0, k])
+        score = gains.pulled[0, k] @ miss
+        found = gains.kept[0, k] @ (x + posterior @ score) + gains.smoothed[0, k] @ (miss + gains.observed[0] @ x)
+        covariance = gains.kept[0, k] @ posterior @ gains.kept[0, k].T + gains.residual[0, k]
+        squares = miss @ gains.precision[0, k] @ miss - score @ posterior @ score
+        size = gains.log_size[0, k] + np.linalg.slogdet(p)[1] - np.linalg.slogdet(posterior)[1]
+        np.testing.assert_allclose(found, expected[0], rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(covariance, expected[1], rtol=1e-5, atol=1e-18)
+        assert squares == pytest.approx(expected[2], rel=1e-6)
+        assert size == pytest.approx(expected[3], abs=1e-6)
+
+
+MODES = (Oscillator(14.0, 0.02), Oscillator(21.0, 0.05))
+SECONDS = 0.02
+NO_NOISE = np.zeros((2, 2))
+SURE = np.zeros((2, 4, 4))
+
+
+def at_rest(at: float) -> np.ndarray:
+    """The state of two axes that rest under a load."""
+    return np.array([[at, 0.0, at, 0.0], [0.0] * 4])
+
+
+def unseen() -> UnseenLoads:
+    return UnseenLoads(MODES, SECONDS, 0.5)
+
+
+def test_a_switched_load_is_held_for_each_span_that_missed_it() -> None:
+    held = unseen()
+    for _ in range(3):
+        held.add(at_rest(0.0), SURE, NO_NOISE)
+    assert not held.variances.any()
+    held.add(at_rest(1e-3), SURE, NO_NOISE)
+    # Spans of 1, 2 and 3 blocks end there and predicted rest; longer ones have not begun.
+    expected = LARGER**2 * 1e-6 / 9.0
+    np.testing.assert_allclose(held.variances[0, :3], expected * np.array([1.0, 0.0, 1.0, 0.0]) * np.ones((3, 1)))
+    assert not held.variances[:, 3:].any()
+    assert not held.variances[1].any()
+
+
+def test_what_the_process_noise_foresaw_is_not_added() -> None:
+    held = unseen()
+    wide = np.tile(np.diag([4e-8, 0.0, 1e-8, 0.0]), (2, 1, 1))
+    rate = np.full((2, 2), 1e-9)
+    held.add(at_rest(0.0), wide, rate)
+    held.add(at_rest(1e-3), wide, rate)
+    mode = MODES[0]
+    phi = mode.step(SECONDS)
+    foreseen = phi @ wide[0] @ phi.T + 1e-9 * mode.added_covariance(np.array([SECONDS]))[0].sum(axis=0)
+    expected = LARGER**2 * np.maximum(np.array([1e-6, 0.0, 1e-6, 0.0]) / 9.0 - foreseen.diagonal(), 0.0)
+    assert 0.0 < expected[0] < 0.9 * LARGER**2 * 1e-6 / 9.0
+    np.testing.assert_allclose(held.variances[0, 0], expected, rtol=1e-12)
+
+
+def test_it_grows_evenly_from_span_to_span() -> None:
+    held = unseen()
+    count = held.variances.shape[1]
+    # Spans of 1, 2, 3, 4, 6, 9, 13, 19 and 28 blocks.
+    assert count == 9
+    held.variances[:] = np.arange(1.0, count + 1.0)[:, None]
+    assert held.after(0.005)[0, 0] == pytest.approx(0.25)
+    assert held.after(SECONDS)[0, 0] == pytest.approx(1.0)
+    assert held.after(5 * SECONDS)[1, 2] == pytest.approx(4.5)
+    assert held.after(28 * SECONDS)[0, 0] == pytest.approx(9.0)
+    assert held.after(10.0)[0, 3] == pytest.approx(9.0)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.measure.uncertainty.consistency import (
     CONTRADICTS,
     DOUBTFUL,
@@ -24,6 +25,7 @@ from psd_deflection.measure.uncertainty.consistency import (
     survival,
     widened,
 )
+from psd_deflection.measure.uncertainty.outliers import OutlierSearch
 from psd_deflection.records import FloatArray
 
 
@@ -228,3 +230,162 @@ def test_two_outlier_candidates_stay_with_both_errors() -> None:
     check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {3})
     assert check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {1, 3}).excluded == 3
     assert check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {1, 2}).excluded == 0
+
+
+FOUR_CENTERS = np.array([[0.1, 0.0], [-0.05, 0.087], [-0.04, -0.087], [0.02, 0.03]])
+ZEROS = np.array([[1e-3, 2e-3], [0.0, 1e-3], [-1e-3, 0.0], [2e-3, -1e-3]])
+OTHER_RNG = np.random.default_rng(1)
+
+
+@pytest.mark.parametrize('psds', [3, 4])
+@pytest.mark.parametrize('unknowns', [3, 5])
+def test_the_first_ones_move_with_the_link_and_the_others_do_not(psds: int, unknowns: int) -> None:
+    count, slopes = 2 * psds, OTHER_RNG.normal(size=(2 * psds, unknowns))
+    centers = FOUR_CENTERS[:psds]
+    of = combinations_of(centers, centers + ZEROS[:psds], slopes)
+    assert (of.moving, of.still) == (unknowns, count)
+    np.testing.assert_allclose(of.turn @ of.turn.T, np.eye(count), atol=1e-14)
+    np.testing.assert_allclose(of.turn[unknowns:] @ slopes, 0.0, atol=1e-13)
+    dots = 1e-3 * OTHER_RNG.normal(size=(7, count))
+    np.testing.assert_allclose(of.of(dots), (dots @ of.turn.T).T, rtol=1e-12)
+    np.testing.assert_allclose(of.fixed(dots), dots @ of.turn[unknowns], rtol=1e-12)
+    mixed = OTHER_RNG.normal(size=(count, count))
+    covariance = mixed @ mixed.T
+    for row, z in zip(dots, of.of(dots).T, strict=True):
+        back, back_covariance = of.back(z[None], covariance[None])
+        np.testing.assert_allclose(back[0], row, atol=1e-17)
+        np.testing.assert_allclose(back_covariance[0], of.turn.T @ covariance @ of.turn, rtol=1e-12)
+    # What does not move is of what the model leaves, if it is asked.
+    half = combinations_of(centers, centers, slopes, lambda d: np.asarray(0.5 * d))
+    np.testing.assert_allclose(half.fixed(dots), 0.5 * of.fixed(dots), rtol=1e-12)
+
+
+def test_a_flat_plate_is_meant_unless_slopes_are_given() -> None:
+    """dX moves each x back, theta moves x by l_y and y by -l_x: of beams, not of centres."""
+    centers = FOUR_CENTERS[:3]
+    beams = centers + ZEROS[:3]
+    of = combinations_of(centers, beams)
+    slopes = np.array([row for x, y in beams for row in ([-1.0, 0.0, y], [0.0, -1.0, -x])])
+    assert of.moving == 3
+    np.testing.assert_allclose(of.turn[3:] @ slopes, 0.0, atol=1e-15)
+
+
+def test_near_dependent_slopes_leave_no_rounding() -> None:
+    """Unit vectors that the first rows span to 1e-7 are left out; those that are 1e-5 apart are taken."""
+    for off, spanned in ((1e-7, True), (1e-5, False)):
+        slopes = np.zeros((6, 3))
+        slopes[[0, 2, 4], [0, 1, 2]] = 1.0
+        slopes[1, 0] = off
+        of = combinations_of(FOUR_CENTERS[:3], FOUR_CENTERS[:3], slopes)
+        np.testing.assert_allclose(of.turn @ of.turn.T, np.eye(6), atol=1e-14)
+        # The first that is not of the slopes: of x1 what is left of it, or y1.
+        assert abs(of.turn[3, 1]) == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(of.turn[3:] @ slopes, 0.0, atol=1e-12)
+        assert (of.turn[3, 1] > 0.0) == spanned
+
+
+def base_line_back(value: list[float], covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    of = combinations_of(FOUR_CENTERS[:2], FOUR_CENTERS[:2] + ZEROS[:2])
+    dots, back_covariance = of.back(np.array([value]), covariance[None])
+    return dots[0], back_covariance[0]
+
+
+def test_the_covariance_of_two_psds_goes_back_as_the_dots_do() -> None:
+    """J C J^T, J by differences of the way back, at a twist of some degrees."""
+    value = [1e-3, -2e-3, 4e-3, 2e-4]
+    mixed = OTHER_RNG.normal(size=(4, 4))
+    covariance = mixed @ mixed.T
+    columns = [
+        (
+            base_line_back([v + e for v, e in zip(value, step, strict=True)], covariance)[0]
+            - base_line_back([v - e for v, e in zip(value, step, strict=True)], covariance)[0]
+        )
+        / 2e-6
+        for step in (1e-6 * np.eye(4)).tolist()
+    ]
+    slopes = np.stack(columns, axis=1)
+    back_covariance = base_line_back(value, covariance)[1]
+    np.testing.assert_allclose(back_covariance, slopes @ covariance @ slopes.T, rtol=1e-6, atol=1e-8)
+
+
+def test_base_line_below_its_twist_keeps_a_hundredth() -> None:
+    """What no plate can show: still a number."""
+    apart = FOUR_CENTERS[0] - FOUR_CENTERS[1]
+    beams = FOUR_CENTERS[:2] + ZEROS[:2]
+    of = combinations_of(FOUR_CENTERS[:2], beams)
+    for twist in (0.2, 5.0):
+        dots = of.back(np.array([[0.0, 0.0, twist, 0.0]]), np.eye(4)[None])[0][0]
+        # The length is that of the beams, and what is along the base line at rest a hundredth of it.
+        length = np.hypot(*(beams[0] - beams[1]))
+        way = (beams[0] - beams[1]) / length
+        along = float((dots[:2] - dots[2:] + apart) @ way)
+        assert along == pytest.approx(0.01 * length, rel=1e-9)
+
+
+CENTERS = np.array([[0.0, 0.070], [-0.100, 0.0]])
+BASE_LINE = tuple((CENTERS[0] - CENTERS[1]).tolist())
+NOISE = 1e-6
+
+
+def dots_of(pose: FloatArray) -> FloatArray:
+    """Of a flat plate, m = R(-theta)(l - d) - c."""
+    dx, dy, theta = pose
+    c, s = math.cos(theta), math.sin(theta)
+    u, v = CENTERS[:, 0] - dx, CENTERS[:, 1] - dy
+    return np.asarray(np.column_stack((c * u + s * v, c * v - s * u)) - CENTERS).ravel()
+
+
+def named(message: FloatArray, should: FloatArray, noise: float) -> str:
+    """Of readings (n, 4) and what they should be: the words, from weighted moments by numpy."""
+    n = len(message)
+    weights = (1.0 - 1.0 / 500.0) ** np.arange(n - 1, -1, -1)
+    if n < 10:
+        return ''
+    orders = ([0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2])
+    off = []
+    for order in orders:
+        apart = CENTERS[0] - CENTERS[1] + message[:, order][:, :2] - message[:, order][:, 2:]
+        off.append(float(weights @ (np.hypot(*apart.T) - math.hypot(*BASE_LINE)) ** 2))
+    for psd in (1, 2):
+        if off[psd] < 0.01 * off[0] and off[psd] < weights.sum() * (10.0 * noise) ** 2:
+            return f'the axes of psd_{psd} are exchanged'
+    found = []
+    for c, name in enumerate(('x1', 'y1', 'x2', 'y2')):
+        own, shared, wanted = np.cov(message[:, c], should[:, c], aweights=weights, ddof=0)[[0, 0, 1], [0, 1, 1]]
+        if wanted < (100.0 * noise) ** 2:
+            continue
+        if own < (5.0 * noise) ** 2:
+            found.append(f'{name} does not move with the others')
+        elif abs(shared / wanted + 1.0) < 0.02 and own - shared**2 / wanted < (10.0 * noise) ** 2 + 1e-4 * wanted:
+            found.append(f'{name} has the wrong sign')
+    return found[0] if len(found) == 1 else ''
+
+
+def test_a_reading_is_named_by_the_moments_of_what_was_observed() -> None:
+    """Readings around each limit of the rules, a reading or two at a time; axes exchanged more or less exactly."""
+    rng = np.random.default_rng(12)
+    reported: dict[str, int] = {}
+    for case in range(500):
+        n = int(rng.choice([9, 10, 11, 40]))
+        should = rng.normal(size=(n, 4)) * NOISE * 10.0 ** rng.uniform(1.7, 3.0, 4)
+        should[:, rng.random(4) < 0.5] *= 1e-3
+        message = should.copy()
+        for i in rng.choice(4, 1 + case % 2, replace=False):
+            slope = rng.choice([0.0, -1.0, -1.0, -1.018, -0.982, -1.022, -0.978, 1.0])
+            scatter = NOISE * rng.choice([0.0, 3.0, 4.5, 5.5, 9.0, 11.0]) + rng.choice([0.0, 0.9e-2]) * np.std(
+                should[:, i]
+            )
+            message[:, i] = slope * should[:, i] + scatter * rng.choice([-1.0, 1.0], n) + 1e-4
+        search = OutlierSearch(CENTERS, CENTERS)
+        if case % 3 == 0:
+            # Poses of some millimetres whose base line is right but for noise once the axes are put right.
+            right = np.array([dots_of(rng.normal(size=3) * (2e-3, 2e-3, 0.02)) for _ in range(n)])
+            right[:, 0] += rng.choice([0.0, 5.0, 12.0, 17.0, 30.0]) * NOISE * rng.choice([-1.0, 1.0], n)
+            message = right[:, [[0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2]][int(rng.integers(3))]]
+            should = message - 1e-5
+        for block in range(n):
+            search.add(tuple(message[block].tolist()), tuple((message[block] - should[block]).tolist()))
+        want = named(message, should, NOISE)
+        assert search.most_likely(NOISE) == want, case
+        reported[want] = reported.get(want, 0) + 1
+    assert len(reported) == 11

@@ -1,8 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The model of the readings against the optics of blind/, and its derivatives against differences of the whole."""
+"""The model of the readings against the optics of blind/, its derivatives, and a rig file's effects as parameters."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,10 +24,11 @@ from psd_deflection.model.misalignment.model import (
     readings,
     response_of,
 )
-from psd_deflection.model.misalignment.rig import known_of_rig, rig_values, vector_of_rig
-from psd_deflection.model.simulation.catalogue import effects_to_values
+from psd_deflection.model.misalignment.rig import CLAMP, known_of_rig, rig_values, vector_of_rig
+from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_to_values
+from psd_deflection.model.simulation.declaration import CALIBRATED_OF_LINK, CALIBRATED_OF_PSD, PLACED_OF_PSD
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import Rig, rig_from_values
+from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_from_values
 
 LENGTH = 0.585
 
@@ -130,3 +134,122 @@ def test_stated_deviations_and_correlations_are_taken() -> None:
     at = [INDEX['psd_1.height'], INDEX['psd_2.height']]
     assert known.covariance[np.ix_(at, at)] == pytest.approx(np.array([[1e-6, -1e-6], [-1e-6, 4e-6]]))
     assert known.covariance[0, 0] == pytest.approx(TOLERANCES[0] ** 2)
+
+
+RIG = load_rig()
+
+OWN = """
+from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter
+
+def _apply(samples, values, state):
+    samples.dots[2 * (int(values['psd']) - 1)] *= 1.0 + values['x']
+
+def _correct(reading, values):
+    reading.dots[2 * (int(values['psd']) - 1)] /= 1.0 + values['x']
+
+EFFECT = Effect(
+    name='my_gain', stage='psd', summary='-', equation='-', source='-', needs='-', point='dots', order=5,
+    parameters=(PSD, EffectParameter('x', '', -0.5, 0.5, 1e-3, 'of x')),
+    apply=_apply, correct=_correct, calibrated_as={'x': 'gain_x'},
+)
+"""
+
+
+def test_user_effect_is_calibrated_as_declared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / 'my_gain.py').write_text(OWN)
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    assert catalogue()['my_gain'].calibrated_as == {'x': 'gain_x'}
+    listed = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
+    rig = load_rig(overrides=listed)
+    vector = vector_of_rig(rig)
+    assert vector.others == []
+    at = INDEX['psd_2.gain_x']
+    assert vector.values[at] == 0.01
+    # What a calibration finds goes into the effect that the file has; of others into the package's own.
+    found = vector.values.copy()
+    found[at] = 0.012
+    found[INDEX['psd_1.rotation']] = TOLERANCES[INDEX['psd_1.rotation']]
+    _, effects = rig_values(vector, found, vector.clamp)
+    own = [a for a in effects if 'psd' in a.values]
+    assert [(a.effect.name, a.values['psd']) for a in own] == [('sensor_rotation', 1.0), ('my_gain', 2.0)]
+    assert own[1].values['x'] == 0.012
+    dots = np.array([[0.0, 0.0, 1.01e-3, 0.0]])
+    assert Correction.from_rig(rig).apply(dots)[0, 2] == pytest.approx(1e-3)
+    found[INDEX['psd_2.gain_y']] = 0.004
+    for known, want in ((vector, ['my_gain', 'sensor_gain']), (vector_of_rig(RIG), ['sensor_gain'])):
+        _, effects = rig_values(known, found, vector.clamp)
+        gains = [a for a in effects if a.effect.name.endswith('gain')]
+        assert [a.effect.name for a in gains] == want
+        assert gains[-1].values['y'] == 0.004
+
+
+@pytest.mark.parametrize(
+    ('name', 'called', 'words'),
+    [
+        ('sensor_gain', {'z': 'gain_x'}, r"calibrated_as = .'z': 'gain_x'.: must name parameters"),
+        ('sensor_gain', {'x': 'gain_x'}, 'calibrated_as: y: not named; a calibration finds all'),
+        ('sensor_gain', {'x': 'gain_x', 'y': 'gian_y'}, "y = 'gian_y': a calibration finds of a PSD: rotation, gain_x"),
+        ('sensor_gain', {'x': 'gain_x', 'y': 'link.slope_ratio'}, "y = 'link.slope_ratio': a calibration finds"),
+        ('sensor_gain', {'x': 'gain_x', 'y': 'gain_x'}, 'has a name twice'),
+        (
+            'sensor_gain',
+            {'x': 'gain_x', 'y': 'height'},
+            'center_x, center_y, height, aimed need an effect of their own',
+        ),
+        ('plane_tilt', {'slope_ratio': 'gain_x'}, 'a calibration finds of the link: link.slope_ratio, clamp'),
+    ],
+)
+def test_a_declaration_that_a_calibration_cannot_use_is_rejected(name: str, called: dict[str, str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        replace(catalogue()[name], calibrated_as=called)
+
+
+def test_what_a_declaration_may_name_is_what_a_calibration_finds() -> None:
+    of_psd = {name.removeprefix('psd_1.') for name in INDEX if name.startswith('psd_1.') and '.zero' not in name}
+    assert {*CALIBRATED_OF_PSD, *PLACED_OF_PSD} == of_psd | {'aimed'}
+    assert set(CALIBRATED_OF_LINK) == {*CLAMP, 'link.slope_ratio'}
+
+
+def test_wrong_user_effect_is_rejected_if_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / 'my_gain.py').write_text(OWN.replace("'gain_x'", "'gian_x'"))
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    with pytest.raises(ConfigError, match=r'my_gain.py: holds no effect .*gian_x'):
+        vector_of_rig(load_rig(overrides={'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}))
+    vector = vector_of_rig(RIG)
+    found = vector.values.copy()
+    found[INDEX['psd_2.gain_x']] = 0.012
+    _, effects = rig_values(vector, found, vector.clamp)
+    assert [a.effect.name for a in effects if 'psd' in a.values] == ['sensor_gain']
+
+
+def test_two_effects_that_give_one_parameter_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / 'my_gain.py').write_text(OWN)
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    own = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
+    ours = {'effects.b.name': 'sensor_gain', 'effects.b.psd': 2}
+    with pytest.raises(ConfigError, match=r'my_gain \(psd 2\) and sensor_gain \(psd 2\): both give psd_2.gain_x'):
+        vector_of_rig(load_rig(overrides={**own, **ours, 'effects.b.x': 0.01}))
+    # They share no parameter: this one's x is off, or it is of the other PSD.
+    for apart in ({'effects.b.y': 0.01}, {'effects.b.x': 0.01, 'effects.b.psd': 1}):
+        assert vector_of_rig(load_rig(overrides={**own, **ours, **apart})).values[INDEX['psd_2.gain_x']] == 0.01
+
+
+def test_an_effect_listed_twice_is_rejected() -> None:
+    twice = {f'effects.{key}.{name}': value for key in 'ab' for name, value in
+             {'name': 'sensor_gain', 'psd': 1, 'x': 0.01}.items()}  # fmt: skip
+    with pytest.raises(ConfigError, match='listed twice'):
+        vector_of_rig(load_rig(overrides=twice))
+
+
+@pytest.mark.parametrize('found', [-0.006, 0.0, 0.3])
+def test_undetermined_slope_ratio_is_written_valid(found: float) -> None:
+    vector = vector_of_rig(RIG)
+    p = vector.values.copy()
+    p[INDEX['link.slope_ratio']] = found
+    values, effects = rig_values(vector, p, vector.clamp)
+    assert values['link.slope_ratio'] == max(found, 0.0)
+    tilts = [a.values['slope_ratio'] for a in effects if 'slope_ratio' in a.values]
+    assert tilts == ([found] if found > 0.0 else [])
+    replace_values(RIG, values)
+    # The caller's own numbers stay.
+    assert p[INDEX['link.slope_ratio']] == found

@@ -1,10 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every method: one block and many agree, names and geometry are checked."""
+"""What holds for every method: one block and many agree, geometry is checked, it converges or says that it does not."""
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import SOLVERS, SolverStatus, make_solver, solver_from_rig
+from psd_deflection.model.solvers.gauss_newton import MAX_STEPS, Minimum, answer, fit
 from psd_deflection.rig.config import rig_from_values
 
 VARIANCES = {
@@ -206,3 +208,150 @@ def test_a_dot_that_is_no_number_has_no_status_ok(golden: Any, method: str, opti
     one = solver.solve(good, VARIANCES['equal'])
     np.testing.assert_allclose(many.pose[[0, 2]], [one[:3], one[:3]], rtol=0, atol=1e-14)
     assert many.status[[0, 2]].tolist() == [one.status] * 2
+
+
+def curve(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
+    """(a, b) to a e^b, a e^2b, a: three readings of two unknowns."""
+    a, b = x
+    e = float(np.exp(b))
+    return [a * e, a * e * e, a], [(e, a * e), (e * e, 2.0 * a * e * e), (1.0, 0.0)]
+
+
+def line(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
+    """Sees the sum of its unknowns only, except where the first is 1."""
+    reports = 1.0 if x[0] == 1.0 else 0.0
+    return [x[0] + x[1], 0.0], [(1.0, 1.0), (reports, 0.0)]
+
+
+def test_a_curve_is_fitted_with_its_covariance() -> None:
+    measured, _ = curve((2.0, 0.3))
+    one = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
+    assert one.converged
+    np.testing.assert_allclose(one.parameters, (2.0, 0.3), atol=1e-12)
+    _, rows = curve((2.0, 0.3))
+    j = np.array(rows)
+    want = np.linalg.inv(j.T @ np.diag([100.0, 25.0, 50.0]) @ j)
+    np.testing.assert_allclose(one.covariance, want, rtol=1e-9)
+
+
+def test_what_cannot_be_observed_is_not_converged() -> None:
+    one = fit(line, (0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
+    assert not one.converged
+    assert np.isnan(one.covariance).all()
+
+
+def test_endless_steps_end() -> None:
+    def away(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
+        # The step is always one, whatever x.
+        return [0.0], [(1.0,)]
+
+    one = fit(away, (0.0,), (1.0,), (1.0,))
+    assert not one.converged
+    assert one.steps == MAX_STEPS == 50
+
+
+def test_a_step_without_end_is_the_last() -> None:
+    """A slope of 1e-150 and a reading of 1e160: 1e310 to go."""
+
+    def flat(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
+        return [0.0], [(1e-150,)]
+
+    one = fit(flat, (0.0,), (1e160,), (1.0,))
+    assert not one.converged
+    assert one.steps == 1
+
+
+def test_the_residual_is_that_at_the_answer_to_the_last_digit() -> None:
+    """Readings that no curve explains: each step is a share of the one before, and the last one still counts."""
+    on, _ = curve((2.0, 0.3))
+    measured = [a + b for a, b in zip(on, (0.9, -0.7, 0.8), strict=True)]
+    one = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
+    assert one.converged
+    assert one.steps > 5
+    want = np.array(measured) - curve(one.parameters)[0]
+    np.testing.assert_allclose(one.residual, want, rtol=0.0, atol=2e-15)
+
+
+def test_an_answer_takes_the_first_three_of_five() -> None:
+    covariance = [[float(10 * min(i, j) + max(i, j)) for j in range(5)] for i in range(5)]
+    for converged in (True, False):
+        got = answer(Minimum([0.0] * 5, covariance, [7.0, 8.0], converged, 4), (1.0, 2.0, 3.0, 4.0, 5.0), covariance)
+        assert got[:5] == (1.0, 2.0, 3.0, 4.0, 5.0)
+        assert got.covariance == (0.0, 1.0, 2.0, 1.0, 11.0, 12.0, 2.0, 12.0, 22.0)
+        assert (got.residual, got.iterations) == ((7.0, 8.0), 4)
+        assert got.status is (SolverStatus.OK if converged else SolverStatus.NOT_CONVERGED)
+
+
+def rig(centers: Any, heights: Any = None, k: float = 1.5, length: float = 0.585) -> Geometry:
+    places = np.array(centers, dtype=float)
+    up = np.zeros(len(places)) if heights is None else np.array(heights, dtype=float)
+    return Geometry(places, np.zeros_like(places), up, length, k)
+
+
+CORNER = [[0.0, 0.07], [-0.1, 0.0]]
+THREE = [[0.1, 0.0], [-0.05, 0.087], [-0.05, -0.087]]
+
+
+@pytest.mark.parametrize('method', SOLVERS)
+def test_coinciding_beams(method: str) -> None:
+    with pytest.raises(SolverError, match=r'beams of psd_1 and psd_2 coincide at .* the twist cannot be seen'):
+        make_solver(method, rig([[0.0, 0.07], [0.0, 0.07]]))
+
+
+@pytest.mark.parametrize('method', SOLVERS)
+def test_one_psd(method: str) -> None:
+    with pytest.raises(SolverError, match=r'cannot tell a twist from a translation; at least 2'):
+        make_solver(method, rig([[0.0, 0.07]]))
+
+
+@pytest.mark.parametrize('method', SOLVERS)
+def test_what_is_no_geometry(method: str) -> None:
+    with pytest.raises(SolverError, match=r'centers must be finite'):
+        make_solver(method, rig([[0.0, float('nan')], [0.0, 0.0]]))
+    with pytest.raises(SolverError, match=r'of the same 2 PSDs'):
+        make_solver(method, Geometry(np.array(CORNER), np.zeros((2, 2)), np.zeros(3), 0.585))
+    with pytest.raises(SolverError, match=r'must be \(number of PSDs, 2\)'):
+        make_solver(method, Geometry(np.zeros(4), np.zeros(4), np.zeros(2), 0.585))
+
+
+@pytest.mark.parametrize('centers', [[[0.0, 0.07], [0.0, -0.07]], [[0.07, 0.0], [-0.07, 0.0]]])
+@pytest.mark.parametrize('method', ['exact', 'wls', 'wls_exact', 'ols', 'iterative', 'beam', 'minimum_tilt'])
+def test_one_of_the_two_rank_conditions_is_enough(rays: Any, method: str, centers: Any) -> None:
+    """The source asks for 4.21 and 4.22; these rigs break one of them and are well-conditioned."""
+    geometry = rig(centers)
+    dots = tuple(rays.tip_dots(geometry, (0.0, 0.0, 1e-6, 0.0, 0.0)).tolist())
+    assert make_solver(method, geometry).solve(dots, (4e-12,) * 4).theta == pytest.approx(1e-6, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('method', 'geometry', 'options', 'message'),
+    [
+        ('beam', rig(CORNER, [-0.39, 0.0]), {}, r'psd_1\.height = -0\.39 m: .*the deflection cannot be seen'),
+        ('beam', rig(CORNER, length=0.0), {}, r'link\.length = 0\.0 m: must be above 0'),
+        ('beam', rig(CORNER, k=float('inf')), {}, r'link\.slope_ratio = inf: must be finite'),
+        ('pose', rig(CORNER, [0.1, -0.1]), {}, r'4 readings for 5 unknowns'),
+        ('pose', rig(THREE), {}, r'coplanar surfaces do not see a tilt'),
+        ('pose', rig([[0.1, 0.0], [0.0, 0.0], [-0.1, 0.0]], [0.1, 0.0, -0.1]), {}, r'lie on one line in space'),
+        ('minimum_tilt', rig(THREE), {}, r'takes two PSDs'),
+        ('minimum_tilt', rig(CORNER, [0.02, 0.02]), {}, r'takes both surfaces at 0'),
+        ('base_pair', rig(CORNER), {}, r'psd_1\.height = 0 m: a PSD at the base stands below'),
+        ('base_pair', rig(CORNER, [-0.585, -0.485]), {'assume': 'nothing'}, r'4 readings for 5 unknowns: with torsion'),
+        ('base_pair', rig(CORNER, [-0.5, -0.5]), {'assume': 'no_twist'}, r'all PSD planes are 0\.5 m from the lasers'),
+        ('base_pair', rig(CORNER, [-0.585, -0.585], k=1.0), {}, r'slope_ratio = 1 with all PSDs 0\.585 m .*Fig\. 5\.9'),
+        ('base_pair', rig(THREE, [-0.5, -0.5, -0.5]), {'assume': 'nothing'}, r'some motion of the tip moves no dot'),
+        ('iterative_printed', rig(THREE), {}, r'takes two PSDs'),
+        ('appendix_d', rig(THREE), {}, r'takes two PSDs'),
+        ('appendix_d', rig([[0.07, 0.0], [-0.1, 0.0]]), {}, r'appendix_d divides by both'),
+        ('appendix_d_ols', rig(THREE), {}, r'takes two PSDs'),
+    ],
+)
+def test_rejected_by_name(method: str, geometry: Geometry, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SolverError, match=message):
+        make_solver(method, geometry, **options)
+
+
+def test_the_rejection_under_torsion_says_how_bad_it_is(rays: Any) -> None:
+    """0.1 degree of twist is read as -1.02 mm of dY (thesis 5.3; docs/audit.md)."""
+    geometry = rig(CORNER, [-0.585, -0.485])
+    with pytest.raises(SolverError, match=r'one degree of twist looks like 10\.2 mm of ΔY'):
+        make_solver('base_pair', geometry, assume='nothing')

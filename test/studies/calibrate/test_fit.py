@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The fit's own pieces against a minimiser that is not ours."""
+"""The fit's pieces and its rows: against another minimiser, known polynomials, and counts."""
 
 from __future__ import annotations
 
@@ -22,10 +22,22 @@ from psd_deflection.studies.calibrate.fit import (
     Kind,
     Linear,
     Noise,
+    deviation_of,
     pose_of_readings,
     prior_of_rig,
     variance_components,
     weight_matrices,
+)
+from psd_deflection.studies.calibrate.observation import (
+    CALM_LEAST,
+    CalibrationRun,
+    Rows,
+    at_rest,
+    joined,
+    noise_of,
+    rest_means,
+    rows_of,
+    smoothed,
 )
 
 
@@ -86,10 +98,163 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: 
     moved = np.einsum('nij,nj->ni', by_pose, rng.normal(size=(n, 3)) * 1e-4)
     residual = moved + share * sd * rng.choice([-1.0, 1.0], n)[:, None] * across
     rows = cast(
-        Any,
-        SimpleNamespace(sd=np.ones((n, 3)), variances=np.full((n, 4), sd**2), run=np.zeros(n, dtype=np.int64)),
+        Any, SimpleNamespace(sd=np.ones((n, 3)), variances=np.full((n, 4), sd**2), run=np.zeros(n, dtype=np.int64))
     )
     linear = Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
     prior = prior_of_rig(rig_from_values({}))
     found = variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
     assert found.dots == pytest.approx(reported)
+
+
+RIG = rig_from_values({})
+PERIOD = 1e-3
+
+
+def seconds(n: int, period: float = PERIOD) -> FloatArray:
+    return np.asarray(period * np.arange(n), dtype=np.float64)
+
+
+T = seconds(200)
+WHERE = np.array([30.0, 57.3, 99.6, 150.49])
+CURVES = np.random.default_rng(0).normal(size=(7, 4)) * 1e-3
+"""Coefficients of polynomials of degree 6 in (t - 0.1 s) / 0.02 s: the fit has their degree."""
+
+
+def on_curves(t: FloatArray, derivative: int = 0) -> FloatArray:
+    u = (t - 0.1) / 0.02
+    columns = [np.polynomial.Polynomial(c).deriv(derivative)(u) for c in CURVES.T]
+    return np.stack(columns, axis=1) / 0.02**derivative
+
+
+def test_polynomial_of_fit_degree_is_found_with_slope() -> None:
+    found = smoothed(on_curves(T), PERIOD, WHERE)
+    assert found.good.all()
+    scale = np.abs(on_curves(T)).max()
+    np.testing.assert_allclose(found.dots, on_curves(WHERE * PERIOD), atol=1e-9 * scale)
+    np.testing.assert_allclose(found.speed, on_curves(WHERE * PERIOD, 1), atol=1e-6 * np.abs(on_curves(T, 1)).max())
+    assert found.squares.max() < 1e-18 * scale
+
+
+def test_gain_is_value_variance_over_sample_variance() -> None:
+    found = smoothed(np.zeros((200, 4)), PERIOD, WHERE)
+    for place, gain in zip(WHERE, found.gain, strict=True):
+        middle = round(place)
+        u = np.arange(-10, 11) / 10.0
+        basis = np.vander(u, 7, increasing=True)
+        weights = np.linalg.pinv(basis).T @ np.vander([(place - middle) / 10.0], 7, increasing=True)[0]
+        assert gain == pytest.approx(float(weights @ weights), rel=1e-9)
+
+
+def test_over_an_exposure_it_is_the_mean() -> None:
+    exposure = 0.008
+    found = smoothed(on_curves(T), PERIOD, WHERE, exposure)
+    at = (np.arange(4000) + 0.5) / 4000 - 0.5
+    means = [on_curves(place * PERIOD + exposure * at).mean(axis=0) for place in WHERE]
+    np.testing.assert_allclose(found.dots, means, atol=1e-6 * np.abs(means).max())
+
+
+def test_a_place_needs_seventeen_samples_about_it_on_both_sides() -> None:
+    dots = np.zeros((200, 4))
+    assert smoothed(dots, PERIOD, np.array([0.0, 5.0, 6.0, 193.0, 194.0, 199.0])).good.tolist() == [
+        *(False, False, True, True, False, False)
+    ]
+    dots[95:99] = np.nan
+    assert smoothed(dots, PERIOD, np.array([100.0])).good.all()
+    dots[99] = np.nan
+    assert not smoothed(dots, PERIOD, np.array([100.0])).good.any()
+    assert not smoothed(np.zeros((200, 4)), PERIOD, np.array([-3.0])).good.any()
+
+
+def run_of(volts: FloatArray, loads: FloatArray | None = None) -> CalibrationRun:
+    return CalibrationRun('x', seconds(len(volts)), volts, np.zeros(0), np.zeros((0, 3)), loads)
+
+
+def lit(n: int, noise: tuple[float, float, float, float], seed: int = 1) -> FloatArray:
+    volts = np.tile([0.5, -0.2, 5.0, 0.1, 0.3, 5.0], (n, 1))
+    volts[:, [0, 1, 3, 4]] += np.random.default_rng(seed).normal(size=(n, 4)) * noise
+    return volts
+
+
+def test_the_noise_of_each_channel_is_found() -> None:
+    noise = (1e-3, 2e-3, 4e-3, 8e-3)
+    assert noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
+
+
+def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
+    t = seconds(3000)
+    loads = np.zeros((3000, 3))
+    loads[1000:1500, 0] = 5.0
+    rest = at_rest(loads, t)
+    assert not rest[1000:1500].any()
+    assert np.flatnonzero(rest[:1000]).min() == pytest.approx(500, abs=1)
+    assert np.flatnonzero(rest[1500:]).min() == pytest.approx(750, abs=1)
+    assert rest[999]
+    assert rest[2999]
+    assert not at_rest(None, t).any()
+
+
+def test_rows_without_reference_are_one_per_block() -> None:
+    noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
+    loads = np.tile([0.0, -5.0, 1.0], (2000, 1))
+    rows = rows_of(run_of(lit(2000, (0.0, 0.0, 0.0, 0.0)), loads), RIG, noise)
+    assert len(rows) == 100
+    np.testing.assert_allclose(np.diff(rows.t), 0.02, rtol=1e-9)
+    assert np.all(rows.loads == [0.0, -5.0, 1.0])
+    # 5 mm at 10 V, and the even distribution of a step.
+    sample = (5e-4) ** 2 * (noise**2 + (20.0 / 65536.0) ** 2 / 12.0)
+    u = np.vander(np.arange(-10, 11) / 10.0, 7, increasing=True)
+    gain = float(np.linalg.inv(u.T @ u)[0, 0])
+    # At the end of the recording a sample is missing.
+    np.testing.assert_allclose(rows.variances[:-1], np.tile(gain * sample, (99, 1)), rtol=1e-6)
+
+
+def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
+    t = seconds(100, 0.02)
+    loads = np.zeros((100, 3))
+    loads[50:, 1] = -10.0
+    dots = np.random.default_rng(2).normal(size=(100, 4)) * 1e-6
+    small, large = np.full((100, 4), 1e-20), np.full((100, 4), 1e-10)
+    zeros, run = np.zeros((100, 3)), np.zeros(100, dtype=np.int64)
+    noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
+    for variances in (small, large):
+        rows = Rows(t, run, zeros, dots, variances, zeros, loads, t >= 0.5, np.ones((100, 3)))
+        found = rest_means(rows, RIG, noise)
+        assert len(found) >= 6
+        assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
+        if variances is small:
+            np.testing.assert_allclose(found.variances, np.tile((5e-4 * noise) ** 2 * CALM_LEAST, (len(found), 1)))
+        else:
+            # Twelve or thirteen rows in a quarter of a second.
+            assert 1e-10 / 13.001 < found.variances.min() <= np.median(found.variances) < 1e-10 / 11.999
+    # Nothing moves, so that a mean is a mean.
+    first = t[(t >= 0.5) & (t < 0.75 - 1e-9)]
+    np.testing.assert_allclose(found.dots[0], dots[[round(x / 0.02) for x in first]].mean(axis=0), rtol=1e-6)
+
+
+def test_references_count_by_their_proportions_if_all_state_them() -> None:
+    zeros, run = np.zeros((4, 3)), np.zeros(4, dtype=np.int64)
+    rest = np.ones(4, dtype=bool)
+
+    def rows(sd: float) -> Rows:
+        dots = np.zeros((4, 4))
+        return Rows(seconds(4, 1.0), run, zeros, dots, dots + 1.0, zeros, zeros, rest, np.full((4, 3), sd))
+
+    both = joined([rows(1e-6), rows(3e-6), rows(3e-6)])
+    assert both.run.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert sorted(set(both.sd.ravel().round(9).tolist())) == pytest.approx([1.0 / 3.0, 1.0])
+    assert np.all(joined([rows(1e-6), rows(np.nan)]).sd == 1.0)
+
+
+def test_half_of_the_deviations_report_that_of_all() -> None:
+    values = np.random.default_rng(3).normal(0.0, 2.0, 20_000)
+    assert deviation_of(values, False) == pytest.approx(2.0, rel=0.02)
+    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.03)
+    values[::10] += 1000.0
+    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
+
+
+def test_the_steps_of_the_converter_are_no_noise() -> None:
+    rig = rig_from_values({'converter.bits': 10})
+    step = 20.0 / 1024.0
+    volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
+    assert noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)

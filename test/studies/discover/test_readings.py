@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of readings: one row for each load that was hung on the link."""
+"""Tables of readings: a row for each load that hung on the link; a recording of loads and a reference as one."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.read.readings_table import is_table
-from psd_deflection.records import FloatArray
+from psd_deflection.recordings.write.bag_writer import McapFile
+from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, TemperatureReading
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.from_recordings import read_tables
 from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.readings import CHANNELS, Readings, ReadingsPlant
-
-pytestmark = pytest.mark.slow
 
 RIG = load_rig()
 LOADS = np.array(
@@ -58,6 +57,7 @@ SOFT = make_active('bending_stiffness', {'scale': -0.05}, 'test')
 ROTATED = make_active('sensor_rotation', {'psd': 2, 'angle': 0.02}, 'test')
 
 
+@pytest.mark.slow
 def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([SOFT]).values)
     assert main(['discover', str(table), '--out', str(tmp_path / 'found')]) == 0
@@ -73,6 +73,7 @@ def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytes
     assert discover_in(ReadingsPlant(read_tables([table], repaired))).verdict == 'nothing_missing'
 
 
+@pytest.mark.slow
 def test_tables_of_two_lengths_report_stiffness_from_the_clamp() -> None:
     found = discover_in(ReadingsPlant([read([SOFT]), read([SOFT], length=0.4, seed=1)]))
     (effect,) = found.effects
@@ -80,12 +81,14 @@ def test_tables_of_two_lengths_report_stiffness_from_the_clamp() -> None:
     assert effect.active.values['scale'] == pytest.approx(-0.05, abs=0.002)
 
 
+@pytest.mark.slow
 def test_estimates_show_rotated_sensor_unlike_poses() -> None:
     found = discover_in(ReadingsPlant([read([ROTATED], 'estimates')], without=['axis_crosstalk']))
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
     assert discover_in(ReadingsPlant([read([ROTATED], 'poses')])).verdict == 'nothing_missing'
 
 
+@pytest.mark.slow
 def test_one_effect_on_both_psds_is_simulated_for_both() -> None:
     gains = [make_active('sensor_gain', {'psd': psd, 'y': 0.01}, 'test') for psd in (1, 2)]
     plant = ReadingsPlant([read([])])
@@ -96,6 +99,7 @@ def test_one_effect_on_both_psds_is_simulated_for_both() -> None:
     np.testing.assert_array_equal(by_model, first)
 
 
+@pytest.mark.slow
 def test_what_depends_on_time_or_on_the_row_before_takes_no_part() -> None:
     names = {e.name: e for e in ReadingsPlant([read([])], without=['refraction']).library}
     assert not {'creep', 'clamp_friction', 'amplifier_lag', 'channel_skew', 'laser_pointing_drift', 'refraction'} & set(
@@ -106,6 +110,7 @@ def test_what_depends_on_time_or_on_the_row_before_takes_no_part() -> None:
     assert len(list(names['bending_stiffness'].variants())) == 1
 
 
+@pytest.mark.slow
 def test_a_settled_reading_is_what_a_long_hold_ends_with() -> None:
     effects = [make_active('self_weight', {'weight_per_length': 20.0}, 'test'), SOFT]
     held = ForwardModel(RIG, effects).expect(np.tile(LOADS[8], (20_000, 1))).volts[:, -1]
@@ -113,12 +118,14 @@ def test_a_settled_reading_is_what_a_long_hold_ends_with() -> None:
     np.testing.assert_allclose(settled, held, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rows_of_one_load_are_left_out_together() -> None:
     (parts,) = ReadingsPlant([read([])]).parts()
     assert parts[0] == parts[-1]
     assert sorted(set(parts.tolist())) == [0, 1, 2, 3, 4, 5]
 
 
+@pytest.mark.slow
 def test_the_rig_files_effects_are_in_the_model() -> None:
     rotated = {f'effects.turned.{k}': v for k, v in (('name', 'sensor_rotation'), ('psd', 2), ('angle', 0.02))}
     table = read([ROTATED])
@@ -129,6 +136,7 @@ def test_the_rig_files_effects_are_in_the_model() -> None:
     assert np.std(rows - 1e6 * table.values.T) < 1.2e6 * NOISE
 
 
+@pytest.mark.slow
 def test_a_mass_is_a_weight_and_an_arm_its_torque(tmp_path: Path) -> None:
     path = tmp_path / 'hung.csv'
     path.write_text(
@@ -145,6 +153,7 @@ def test_a_mass_is_a_weight_and_an_arm_its_torque(tmp_path: Path) -> None:
     assert 'columns that are not read: by' in message[1]
 
 
+@pytest.mark.slow
 def test_a_table_has_the_wiring_of_the_rig(tmp_path: Path) -> None:
     readings = np.arange(4.0 * len(LOADS)).reshape(-1, 4)
     path = written(tmp_path / 'hung.csv', readings)
@@ -152,6 +161,7 @@ def test_a_table_has_the_wiring_of_the_rig(tmp_path: Path) -> None:
     np.testing.assert_allclose(table.values, 1e-3 * readings[:, [2, 3, 0, 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('text', 'words'),
     [
@@ -178,6 +188,7 @@ def test_a_table_that_lacks_something_says_what(tmp_path: Path, text: str, words
         read_tables([path])
 
 
+@pytest.mark.slow
 def test_mixed_tables_and_recordings_are_rejected(tmp_path: Path) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
     (tmp_path / 'list.yaml').write_text('- hung.csv\n- recording: run.csv\n')
@@ -194,6 +205,7 @@ def test_mixed_tables_and_recordings_are_rejected(tmp_path: Path) -> None:
     assert not is_table(tmp_path / 'none.csv')
 
 
+@pytest.mark.slow
 def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
     assert main(['discover', str(table), '--out', str(tmp_path / 'found'), '--next']) == 2
@@ -202,6 +214,7 @@ def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: 
     assert 'discover and info take a table of readings without times' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('rest', ['0', ''])
 def test_dial_gauge_is_searched_beside_empty_columns(tmp_path: Path, rest: str) -> None:
     """Readings that are exactly as simulated are no measurement; nothing is held against them."""
@@ -212,3 +225,89 @@ def test_dial_gauge_is_searched_beside_empty_columns(tmp_path: Path, rest: str) 
     assert found.verdict in ('effects_found', 'unknown_effect')
     assert 0.0 < found.gap_before < 0.1 * 1e6
     assert found.per_channel['ref_dx'][0] == 0.0
+
+
+TABLE_LOADS = np.array(
+    [(0, 0, 0), (0, -10, 0), (0, -30, 0), (20, 0, 0), (0, -50, -29), (0, -20, 10), (-20, 0, 0), (0, 0, 0)]
+)
+HELD, EVERY, START = 6.0, 0.05, 1_700_000_000_000_000_000
+REFERENCE_NOISE = np.array([2e-6, 2e-6, 5e-6])
+LATE = (0.0, 1.2, 0.4, 2.5, 0.0, 1.9, -0.6, 0.8)
+"""s by which each load was noted late."""
+
+
+def measured(effects: Sequence[ActiveEffect]) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) s and poses (n, 3) of a camera that sees the tip ring after each load."""
+    each = round(HELD * RIG.converter.sample_rate_hz)
+    pose = ForwardModel(RIG, effects).expect(np.repeat(TABLE_LOADS.astype(np.float64), each, axis=0)).pose.T
+    step = round(EVERY * RIG.converter.sample_rate_hz)
+    observed = pose[::step]
+    noise = np.random.default_rng(1).normal(size=observed.shape) * REFERENCE_NOISE
+    return np.linspace(0.0, EVERY * (len(observed) - 1), len(observed)), np.asarray(observed + noise, dtype=np.float64)
+
+
+def recorded(path: Path, effects: Sequence[ActiveEffect], loads: bool = True) -> Path:
+    """A bag of that, with the loads as a person noted them."""
+    t, poses = measured(effects)
+    file = McapFile(path, rig_values=RIG.values)
+    if loads:
+        for i, (load, late) in enumerate(zip(TABLE_LOADS.tolist(), LATE, strict=True)):
+            # The page tells the load again and again.
+            for again in (0.0, 1.0):
+                file.put(AppliedLoad(START + round(1e9 * (i * HELD + late + again)), *map(float, load)))
+    file.put(TemperatureReading(START, 21.5))
+    for at, pose in zip(t.tolist(), poses.tolist(), strict=True):
+        file.put(ReferencePose(START + round(1e9 * at), *pose))
+    file.close()
+    return path
+
+
+def test_reference_names_link_effect_with_late_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = recorded(tmp_path / 'camera.mcap', [SOFT])
+    assert main(['discover', str(bag), '--out', str(tmp_path / 'found')]) == 0
+    assert 'bending_stiffness' in capsys.readouterr().out
+    found = json.loads((tmp_path / 'found' / 'result.json').read_text())
+    (effect,) = found['effects']
+    assert {effect['name'], *effect['equivalent']} == {'bending_stiffness', 'clamp_bending_compliance'}
+    # Metres and radians are one gap, of what moves at the distance of the PSDs.
+    assert found['gap']['unit'] == 'µm'
+    of_each = [c['before'] for c in found['gap']['per_channel'].values()]
+    distance = float(np.sqrt(np.mean(np.sum(RIG.centers**2, axis=1))))
+    assert found['gap']['before'] == pytest.approx(float(np.sqrt(np.mean(np.multiply(of_each, (1, 1, distance)) ** 2))))
+    repaired = load_rig(tmp_path / 'found' / 'model.yaml')
+    assert discover_in(ReadingsPlant(read_tables([bag], repaired))).verdict == 'nothing_missing'
+
+
+@pytest.mark.slow
+def test_a_table_with_times_gives_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    t, poses = measured([SOFT])
+    annotated = np.searchsorted(HELD * np.arange(len(TABLE_LOADS)) + np.array(LATE), t, side='right') - 1
+    lines = [
+        ','.join(map(repr, (at, *map(float, TABLE_LOADS[i]), *pose)))
+        for at, i, pose in zip(t.tolist(), annotated.tolist(), poses.tolist(), strict=True)
+    ]
+    lines[5] = lines[5].rsplit(',', 3)[0] + ',,,'
+    path = tmp_path / 'camera.csv'
+    path.write_text('\n'.join(('t,load_fx,load_fy,load_tz,ref_dx,ref_dy,ref_theta', *lines)) + '\n')
+    (of_table,) = read_tables([path])
+    (of_bag,) = read_tables([recorded(tmp_path / 'camera.mcap', [SOFT])])
+    np.testing.assert_array_equal(of_table.loads, of_bag.loads)
+    np.testing.assert_allclose(of_table.values, of_bag.values, rtol=0, atol=2e-6)
+    assert main(['info', str(path)]) == 0
+    assert '0 to 47.95 s: discover takes what rests under each load' in capsys.readouterr().out
+
+
+def test_what_a_reference_alone_lacks_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(RecordingError, match=r'camera\.mcap: holds references, but neither samples nor loads'):
+        read_tables([recorded(tmp_path / 'camera.mcap', [], loads=False)])
+    path = tmp_path / 'swept.csv'
+    rows = ''.join(f'{0.1 * i},{float(i)},0,0,0,0,0\n' for i in range(20))
+    path.write_text(f't,load_fx,load_fy,load_tz,ref_dx,ref_dy,ref_theta\n{rows}')
+    with pytest.raises(RecordingError, match=r'swept\.csv: no load hung for as long as 3 references'):
+        read_tables([path])
+    path.write_text('t,load_fx,load_fy,load_tz,dx,dy,theta\n0,0,0,0,0,0,0\n')
+    assert main(['discover', str(path), '--out', str(tmp_path / 'found')]) != 0
+    assert 't,x1,y1,sum1,x2,y2,sum2' in capsys.readouterr().err
+    bag = recorded(tmp_path / 'second.mcap', [])
+    assert main(['discover', str(bag), '--out', str(tmp_path / 'found'), '--from', '2']) == 2
+    assert '--from, --to: are for recordings of samples' in capsys.readouterr().err

@@ -1,10 +1,13 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What remains without a name as one smooth function, found by discover_in on a table of readings."""
+"""What remains without a name: one smooth function, or many small terms that predict."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,11 +18,16 @@ from scipy.stats import multivariate_normal
 import psd_deflection
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.studies.discover.plant_search import PlantComparison
+from psd_deflection.studies.discover.plant_search import PlantComparison, PlantDiscovery
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.search import predictive
 from psd_deflection.studies.discover.search import smooth as smoothing
 from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.smooth import Remainders, Smooth, smooth_of, unseen_residual
+
+from .test_rules import FINE, SIGMA, active, candidate, columns, noise, pictures
+from .test_rules import Plant as LinearPlant
 
 NOISE = 0.1
 SLOPE = plant_effect('slope', EffectParameter('size', 'mm', -9.0, 9.0, 0.1, 'per turn'))
@@ -171,3 +179,205 @@ def test_shared_sizes_leave_the_likelihood_once() -> None:
     steps = 1e-5 * np.eye(6).reshape(6, 2, 3)
     numeric = [(exact(second + h) - exact(second - h)) / 2e-5 for h in steps]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
+
+
+TERMS = 30
+
+
+class Small(Plant):
+    """Two channels, points that count by themselves; each term is a random picture, ``sizes`` the true ones."""
+
+    channels, units, cases = ('a', 'b'), ('m', 'm'), ('all',)
+
+    def __init__(self, sizes: FloatArray, points: int = 40, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.library = tuple(
+            plant_effect(f't{i}', EffectParameter('size', 'm', -50.0, 50.0, 0.3, '')) for i in range(len(sizes))
+        )
+        # Neighbours are alike, as harmonics of few stars are.
+        raw = rng.standard_normal((len(sizes), 2, points))
+        self.pictures = raw + 0.7 * np.roll(raw, 1, axis=0)
+        self.truth = np.tensordot(sizes, self.pictures, 1)
+        self.observed = self.truth + rng.standard_normal(self.truth.shape)
+
+    def measured(self) -> list[FloatArray]:
+        return [self.observed]
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        terms = [v['size'] * self.pictures[int(name[1:])] for name, v in model.items()]
+        return [np.sum([np.zeros_like(self.observed), *terms], axis=0)]
+
+    def parts(self) -> Sequence[IntArray]:
+        return [np.arange(self.observed.shape[1])]
+
+    def cut(self, at: slice) -> Small:
+        out = Small(np.zeros(len(self.pictures)), 1)
+        out.pictures, out.truth, out.observed = self.pictures[..., at], self.truth[:, at], self.observed[:, at]
+        return out
+
+
+def forward_backward(plant: Small) -> Model:
+    """Terms by the smallest N log RSS + k log N, one added or dropped at a time."""
+    table, y = plant.pictures.reshape(TERMS, -1).T, plant.observed.ravel()
+    chosen: frozenset[int] = frozenset()
+
+    def sizes(terms: frozenset[int]) -> FloatArray:
+        return np.asarray(np.linalg.lstsq(table[:, sorted(terms)], y, rcond=None)[0])
+
+    def bic(terms: frozenset[int]) -> float:
+        residual = y - table[:, sorted(terms)] @ sizes(terms)
+        return float(len(y) * np.log(residual @ residual) + len(terms) * np.log(len(y)))
+
+    while (best := min((chosen ^ {j} for j in range(TERMS)), key=bic)) and bic(best) < bic(chosen):
+        chosen = best
+    return {f't{j}': {'size': float(v)} for j, v in zip(sorted(chosen), sizes(chosen), strict=True)}
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_twelve_small_terms_are_predicted_as_by_bic_or_better(seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    sizes = np.zeros(TERMS)
+    sizes[rng.permutation(TERMS)[:12]] = rng.uniform(1.5, 3.0, 12) * rng.choice([-1, 1], 12) / np.sqrt(80 * 1.5)
+    full = Small(sizes, 440, seed)
+    observed, new = full.cut(slice(0, 40)), full.cut(slice(40, 440))
+    found = psd_deflection.discover_in(observed)
+
+    def wrong(model: Model) -> float:
+        return float(np.sqrt(np.mean((new.simulate(model)[0] - new.truth) ** 2)))
+
+    assert np.hypot(1.0, wrong(found.predictive)) <= 1.1 * np.hypot(1.0, wrong(forward_backward(observed)))
+    assert wrong(found.predictive) < wrong({e.name: e.values for e in found.effects})
+    np.testing.assert_array_equal(found.predict(new)[0], new.simulate(found.predictive)[0])
+
+
+def test_what_small_terms_do_together_is_reported_everywhere() -> None:
+    rng = np.random.default_rng(5)
+    found = psd_deflection.discover_in(Small(0.22 * rng.standard_normal(TERMS), 60, 5))
+    tree = json.loads(found.json())
+    assert (found.verdict, tree['remains']) == ('unknown_effect', True)
+    message = tree['predictive']
+    assert message['nested']
+    assert message['unseen'] < message['unseen_named']
+    assert f'{len(message["terms"])} small terms together lower the unseen error' in found.sentence
+    assert 'small terms together' in found.files()['report.html']
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('seed', range(2))
+def test_nothing_is_reported_to_remain_where_nothing_does(seed: int) -> None:
+    found = psd_deflection.discover_in(Small(np.zeros(TERMS), 40, seed))
+    tree = json.loads(found.json())
+    assert (found.verdict, tree['remains'], tree['predictive']) == ('nothing_missing', False, None)
+
+
+class Zeros(Plant):
+    """Four runs, each of which was zeroed anew; what one run's zero is, no other tells."""
+
+    channels, units = ('force',), ('N',)
+    cases = ('1', '2', '3', '4')
+    library = tuple(plant_effect(f'zero_{i}', EffectParameter('shift', 'N', -9.0, 9.0, 0.5, '')) for i in range(1, 5))
+    shifts = (1.0, -0.7, 0.4, -1.2)
+
+    def measured(self) -> list[FloatArray]:
+        rng = np.random.default_rng(0)
+        return [s + 0.05 * rng.standard_normal((1, 20)) for s in self.shifts]
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        of: Mapping[str, float] = {name: values['shift'] for name, values in model.items()}
+        return [np.full((1, 20), of.get(f'zero_{c}', 0.0)) for c in self.cases]
+
+
+@pytest.fixture(scope='module')
+def zeros() -> PlantDiscovery:
+    return psd_deflection.discover_in(Zeros())
+
+
+def test_the_zero_of_a_run_left_out_is_not_known(zeros: PlantDiscovery) -> None:
+    assert sorted(e.name for e in zeros.effects) == ['zero_1', 'zero_2', 'zero_3', 'zero_4']
+    assert zeros.gap_after < 0.06
+    assert zeros.gap_heldout_after == pytest.approx(zeros.gap_before, rel=0.01)
+
+
+# The pieces, by counting all subsets and by least squares of numpy.
+
+
+def all_subsets(f: FloatArray, g: FloatArray, energy: float, size: float) -> tuple[FloatArray, FloatArray]:
+    """Mean sizes of the terms, and how likely each takes part, over all subsets and precisions of the sizes."""
+    count = len(g)
+    rows = []
+    for inside in itertools.product((False, True), repeat=count):
+        n, at = sum(inside), np.flatnonzero(inside)
+        for slab in predictive.SLABS:
+            room = f[np.ix_(at, at)] + slab * np.eye(n)
+            mean = np.linalg.solve(room, g[at])
+            log = 0.5 * (n * np.log(slab) - np.linalg.slogdet(room)[1]) - np.log(math.comb(count, n))
+            rows.append((log - 0.5 * size * np.log(energy - mean @ g[at]), at, mean))
+    most = max(log for log, _, _ in rows)
+    sizes, weights, total = np.zeros(count), np.zeros(count), 0.0
+    for log, at, mean in rows:
+        p = np.exp(log - most)
+        sizes[at] += p * mean
+        weights[at] += p
+        total += p
+    return sizes / total, weights / total
+
+
+@pytest.mark.parametrize(('slabs', 'near'), [(predictive.SLABS, 0.06), (np.array([1.0]), 0.02)])
+def test_averages_are_those_over_all_subsets(slabs: FloatArray, near: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(predictive, 'WALK', (1000, 8, 1000))
+    monkeypatch.setattr(predictive, 'SLABS', slabs)
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal((80, 4))
+    x[:, 1] += 0.8 * x[:, 0]
+    y = 0.4 * x[:, 0] + 0.25 * x[:, 2] + 0.9 * rng.standard_normal(80)
+    given = (x.T @ x, x.T @ y, float(y @ y), 80.0)
+    sizes, weights = predictive.averaged(*given, rng)
+    want, likely = all_subsets(*given)
+    np.testing.assert_allclose(weights, likely, atol=near)
+    np.testing.assert_allclose(sizes, want, atol=0.3 * near)
+    # What is explained already, and nothing to explain.
+    f = np.diag([80.0, 80.0 * 1e-7])
+    sizes, weights = predictive.averaged(f, np.array([40.0, 1e-9]), 80.0, 80.0, rng)
+    assert sizes == pytest.approx([40.0 / 81.0, 0.0], rel=0.05, abs=1e-6)
+    for nothing in (predictive.averaged(1e-7 * f, f[0], 80.0, 80.0, rng), predictive.averaged(f, f[0], 0.0, 80.0, rng)):
+        np.testing.assert_array_equal(nothing, np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(('size', 'remains'), [(0.5, True), (0.0, False)])
+def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool) -> None:
+    """Small terms beside a named effect of which one number, 900 times the noise, is no amplitude."""
+    names = ('a', 'x'), ('a', 'shape'), ('b', 'x'), ('b', 'y'), ('c', 'x')
+    truth = (SIGMA, 0.9, size * SIGMA, -0.8 * size * SIGMA, 0.6 * size * SIGMA)
+    shown = pictures(*names)
+    plant = LinearPlant(shown, sum((v * shown[n] for n, v in zip(names, truth, strict=True)), noise()))
+    a = active('a', x=0.5, shape=0.1)
+    x, shape = a.effect.parameters
+    both = (x, dataclasses.replace(shape, kind='shape'))
+    fit = refit(plant, [ActiveEffect(dataclasses.replace(a.effect, parameters=both), a.values)])
+    found = [
+        (candidate('b', 'x', 'y'), [[1e-3 * shown['b', 'x']], [1e-3 * shown['b', 'y']]]),
+        (candidate('c', 'x'), [[1e-3 * shown['c', 'x']]]),
+    ]
+    got = predictive.predictive_of(plant, fit, Screen(plant, found), np.random.default_rng(0))
+    assert got is not None
+    table, y = columns(shown, *names) * SIGMA, plant.measured[0].ravel()
+    fold = np.tile(plant.case[0] % 4, 6)
+
+    def unseen(columns: FloatArray) -> float:
+        rest = np.empty_like(y)
+        for k in range(4):
+            sizes = np.linalg.lstsq(columns[fold != k], y[fold != k], rcond=None)[0]
+            rest[fold == k] = y[fold == k] - columns[fold == k] @ sizes
+        return plant.gap([rest.reshape(6, FINE)])
+
+    assert got.unseen_named == pytest.approx(unseen(table[:, :2]), rel=1e-6)
+    assert got.unexplained is remains
+    assert (got.tree() is None) is not remains
+    if remains:
+        assert got.unseen == pytest.approx(unseen(table), rel=2e-3)
+        assert [t.name for t in got.terms] == ['b x', 'b y', 'c']
+        want = np.linalg.lstsq(table, y, rcond=None)[0]
+        assert [t.value for t in got.terms] == pytest.approx(want[2:].tolist(), rel=0.02)
+        assert [t.weight for t in got.terms] == pytest.approx([1.0] * 3, abs=1e-3)
+        values = [v for a in got.effects for v in a.values.values()]
+        assert values == pytest.approx(want.tolist(), rel=0.02)

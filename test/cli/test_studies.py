@@ -1,9 +1,10 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``psd-deflection calibrate`` from files to files."""
+"""``calibrate``, ``identify`` and ``validate`` from files to files, and what they reject."""
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import psd_deflection
+from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 
@@ -209,3 +212,108 @@ def test_what_does_not_go_with_dark_levels_is_rejected(
     assert ended == status
     assert re.search(words, capsys.readouterr().err)
     assert not Path('x').exists()
+
+
+@pytest.fixture(scope='module')
+def rung(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two steps of a link at 11 Hz; its rig file says 14 Hz."""
+    path = tmp_path_factory.mktemp('run') / 'run.csv'
+    world = ['--world', 'dynamics.bending_frequency=11.0', '--world', 'dynamics.torsion_damping_ratio=0.01']
+    assert main(['simulate', '--out', str(path), '--loads', 'steps:0,0,0;3,-10,-5.85;0,0,0:2', *world]) == 0
+    return path
+
+
+def test_the_modes_of_the_link_not_of_the_file(rung: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['identify', str(rung), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    for axis in ('dx', 'dy'):
+        (mode,) = found['axes'][axis]['modes']
+        assert found['axes'][axis]['how'] == 'ring-down'
+        assert mode['frequency'] == pytest.approx(11.0, rel=5e-4)
+        assert mode['damping_ratio'] == pytest.approx(0.02, rel=0.03)
+    (torsion,) = found['axes']['theta']['modes']
+    assert torsion['frequency'] == pytest.approx(21.0, rel=5e-4)
+    assert torsion['damping_ratio'] == pytest.approx(0.01, rel=0.03)
+    assert found['axes']['dy']['shaper']['name'] in ('zv', 'mzv', 'zvd', 'ei')
+    assert set(found['parameters']) < set(load_rig(None).values)
+
+
+def test_a_link_at_rest_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'still.csv'
+    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:2']) == 0
+    capsys.readouterr()
+    assert main(['identify', str(path)]) == 0
+    assert capsys.readouterr().out.count('no mode stands out of the noise. Knock on the link') == 3
+
+
+@pytest.fixture(scope='module')
+def moved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight seconds with two steps, and the true pose in it as a reference."""
+    path = tmp_path_factory.mktemp('run') / 'run.csv'
+    loads = 'steps:0,0,0;0,-10,-5.85;0,0,0:2.5'
+    assert main(['simulate', '--out', str(path), '--loads', loads, '--reference']) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def late(moved: Path) -> Path:
+    """The reference in a table of its own, 12.5 ms late, with one rejected frame."""
+    path = moved.parent / 'camera.csv'
+    with moved.open() as stream, path.open('w') as out:
+        out.write('t,dx,dy,theta,sd_dx,sd_dy,sd_theta,status\n')
+        for row in csv.DictReader(stream):
+            if row['ref_dx']:
+                pose = ','.join(row[name] for name in ('ref_dx', 'ref_dy', 'ref_theta'))
+                out.write(f'{float(row["t"]) + 0.0125:.6f},{pose},1e-7,1e-7,1e-6,ok\n')
+        out.write('7.6,,,,,,,blurred\n')
+    return path
+
+
+def test_the_offset_is_reported_and_removed_if_asked(
+    moved: Path, late: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['validate', str(moved), '--reference', str(late), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    # The blocks' stamps lie in the middle of 20 samples; the row of the reference is the next one, half a sample on.
+    assert found['offset']['value'] == pytest.approx(-0.0125, abs=0.6e-3)
+    assert found['offset']['determined']
+    assert not found['offset']['applied']
+    assert found['rejected'] == {'blurred': 1}
+    without = found['solvers']['exact']['dy']['rms']
+    assert main(['validate', str(moved), '--reference', str(late), '--align', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['offset']['applied']
+    assert found['solvers']['exact']['dy']['rms'] < 0.01 * without
+
+
+def test_other_solvers_are_compared_if_asked(moved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def compared(*words: str) -> list[str]:
+        assert main(['validate', str(moved), '--json', *words]) == 0
+        return list(json.loads(capsys.readouterr().out)['solvers'])
+
+    assert compared() == ['exact']
+    assert compared('--solver', 'wls', '--solver', 'beam') == ['exact', 'wls', 'beam']
+    everyone = compared('--solver', 'all')
+    assert everyone[0] == 'exact'
+    assert {'wls', 'beam', 'appendix_d'} < set(everyone)
+    with pytest.raises(SystemExit):
+        main(['validate', str(moved), '--solver', 'bean'])
+    assert "invalid choice: 'bean'" in capsys.readouterr().err
+
+
+def test_unsuitable_solver_is_reported_if_named(moved: Path) -> None:
+    # Both centres on one line through the middle.
+    rig = load_rig(overrides={'psd_2.center': [0.0, -0.07]})
+    assert 'appendix_d' not in psd_deflection.validate(moved, rig=rig, solvers=['all']).agreements
+    with pytest.raises(PsdDeflectionError, match='appendix_d divides by both'):
+        psd_deflection.validate(moved, rig=rig, solvers=['appendix_d'])
+
+
+def test_a_recording_without_a_reference_says_how_to_give_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'bare.csv'
+    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:1']) == 0
+    capsys.readouterr()
+    assert main(['validate', str(path)]) == 4
+    assert 'holds no reference' in capsys.readouterr().err
