@@ -71,11 +71,6 @@ def test_the_tree_as_it_is_has_no_problem() -> None:
     assert problems(ROOT) == []
 
 
-def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None:
-    ready(tree)
-    assert problems(tree, release=True) == []
-
-
 @pytest.mark.parametrize(
     ('sabotage', 'message'),
     [

@@ -15,7 +15,7 @@ import pytest
 
 from tools.allow_contract import broken_by
 from tools.mutants_by_hand import KINDS, hand_made
-from tools.rooms import large_functions, private_names
+from tools.rooms import large_functions
 from tools.tiers import ROOMS
 
 ROOT = Path(__file__).parents[1]
@@ -68,14 +68,6 @@ def test_no_class_name_stands_for_two_things() -> None:
                     places[node.name].append(str(path.relative_to(ROOT)))
     assert len(places) > 300
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
-
-
-def test_private_names_are_counted(tmp_path: Path) -> None:
-    (tmp_path / 'test_it.py').write_text(
-        'module._part(self._own, cls._own)\na.b._cut = Other._D = __name__ + one._two()\n'
-        'point._replace(x=1)._asdict()\n'
-    )
-    assert private_names(tmp_path) == ['module._part', 'b._cut', 'one._two']
 
 
 def test_no_function_is_large() -> None:

@@ -174,14 +174,6 @@ def test_the_keyboard_moves_the_cursor_and_looks_closer(page: Page) -> None:
 
 
 @pytest.mark.slow
-def test_a_chart_in_closed_details_is_drawn_when_they_open(page: Page) -> None:
-    page.driver.find_element(By.TAG_NAME, 'summary').click()
-    page.until('document.querySelectorAll(".uplot").length === 6')
-    page.until(f'{DRAWN}("c2p0", "violet") > 50')
-    page.driver.find_element(By.ID, 'plot_c2p1').send_keys(Keys.ARROW_RIGHT, '+', '0')
-
-
-@pytest.mark.slow
 def test_the_charts_are_accessible_and_no_wider_than_a_phone(page: Page) -> None:
     page.js('document.querySelector("details").setAttribute("open", "")')
     found = []

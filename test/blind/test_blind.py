@@ -14,7 +14,6 @@ from blind.cases import (
     EFFECTS,
     NOISES,
     Case,
-    cases_by_hand,
     designs,
     short_cases,
 )
@@ -72,48 +71,10 @@ def test_a_hidden_effect_is_named(key: str) -> None:
     assert found.simulations <= 2000
 
 
-def test_times_at_the_noise_stay_beside_a_nonlinear_effect() -> None:
-    """Friction: a further step of the free times led away."""
-    key = 'hand-slow-64146-clamp_friction'
-    case = next(c for c in cases_by_hand(64000, 200) if c.key == key)
-    answer, found = run.answer(case, run.truth_of(case))
-    assert [e['name'] for e in answer['effects']] == ['clamp_friction']
-    assert (answer['verdict'], answer['unknown']) == ('effects_found', [])
-    assert found.floors < 1.05
-
-
 @pytest.mark.parametrize('noise', ['white', *NOISES])
 def test_nothing_is_missing_from_noise_of_any_kind(noise: str) -> None:
     answer, _ = run.answer(Case(f'slice-{noise}', 'null', 'one', (), noise=noise), [])
     assert answer['verdict'] == 'nothing_missing'
-
-
-def test_an_unnoted_torque_beside_a_soft_link_has_its_time() -> None:
-    key = 'hand-forgotten-65019-torsional_stiffness'
-    case = Case(key, 'hand', 'hand-forgotten-65019', (), mistake=('hand', 0.0))
-    truth = {'name': 'torsional_stiffness', 'moves_frequency': 1, 'scale': 0.006287795979194355}
-    found, _ = run.answer(case, [truth])
-    assert not found['unknown']
-    assert [e['name'] for e in found['effects']] == ['torsional_stiffness']
-    assert found['effects'][0]['parameters']['scale']['value'] == pytest.approx(truth['scale'], rel=1e-3)
-    (forgotten,) = found['setup']
-    # It was one sample off, in which the link turns by thirteen times the noise.
-    assert (forgotten['name'], forgotten['where']) == ('missing_load', '48.540 s')
-    assert forgotten['value'] == pytest.approx([0.0, -40.0, -23.4], abs=0.002)
-
-
-def test_right_loads_beside_a_sticking_clamp_stay() -> None:
-    case = Case('spread-81014-tip_mass-mount_tilt-clamp_friction', 'spread', 'two', ())
-    found, _ = run.answer(
-        case,
-        [
-            {'name': 'tip_mass', 'mass': 0.0005053527573859099},
-            {'name': 'mount_tilt', 'x': -2.3576229901900842e-07, 'y': 1.893015547892475e-05},
-            {'name': 'clamp_friction', 'axis': 3, 'width': 0.00016795581759153236},
-        ],
-    )
-    assert {e['name'] for e in found['effects']} == {'tip_mass', 'mount_tilt', 'clamp_friction'}
-    assert (found['setup'], found['unknown']) == ([], [])
 
 
 def test_what_is_left_unreported_fails_the_suite() -> None:

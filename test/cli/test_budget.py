@@ -8,7 +8,6 @@ import csv
 import json
 import math
 import re
-from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -198,54 +197,6 @@ def certified(calibrated: Path) -> Path:
 def _rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline='', encoding='utf-8') as file:
         return list(csv.DictReader(file))
-
-
-def _student(probability: float, freedom: float) -> float:
-    """The quantile by summing the density up (Simpson) and halving the interval; no library of statistics."""
-    if math.isinf(freedom):
-        return 1.959963984540054
-    scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(freedom * math.pi)
-
-    def share(k: float) -> float:
-        n = 2000
-        values = [(1 + (k * i / n) ** 2 / freedom) ** (-(freedom + 1) / 2) for i in range(n + 1)]
-        return float(scale * k / n / 3 * (values[0] + values[-1] + 4 * sum(values[1::2]) + 2 * sum(values[2:-1:2])) * 2)
-
-    low, high = 0.0, 20.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if share(middle) < probability else (low, middle)
-    return low
-
-
-@pytest.mark.slow
-def test_the_tables_give_every_u_again(certified: Path) -> None:
-    """As a person does in a spreadsheet: from inputs.csv and correlations.csv alone."""
-    inputs = _rows(certified / 'inputs.csv')
-    correlations = {row['']: row for row in _rows(certified / 'correlations.csv')}
-    results = _rows(certified / 'results.csv')
-    assert len(results) == 7
-    for result in results:
-        for axis in AXES:
-            variances: dict[str, float] = defaultdict(float)
-            freedom = {row['cause']: float(row['nu']) for row in inputs}
-            g = {
-                (row['cause'], row['parameter']): float(row['u']) * float(row[f'c_{axis}_{result["pose"]}'])
-                for row in inputs
-            }
-            for (cause, p), a in g.items():
-                if cause != 'calibration':
-                    variances[cause] += a * a
-                    continue
-                for q, one in correlations.items():
-                    variances[cause] += a * float(one[p]) * g[cause, q]
-            total = math.fsum(variances.values())
-            doubt = math.fsum(v * v / freedom[cause] for cause, v in variances.items())
-            effective = math.floor(total**2 / doubt)
-            k = _student(0.95, effective)
-            assert float(result[f'u_c_{axis}']) == pytest.approx(math.sqrt(total), rel=1e-9)
-            assert float(result[f'nu_eff_{axis}']) == effective
-            assert float(result[f'U_{axis}']) == pytest.approx(k * math.sqrt(total), rel=1e-6)
 
 
 def test_the_page_has_the_same_numbers(certified: Path) -> None:

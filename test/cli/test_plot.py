@@ -22,19 +22,6 @@ from psd_deflection.records import FloatArray
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(('ending', 'magic'), [('.png', b'\x89PNG'), ('.svg', b'<?xml'), ('.html', b'<!doctype html>')])
-def test_a_recording_is_drawn(tmp_path: Path, ending: str, magic: bytes, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / f'picture{ending}'
-    assert main(['plot', str(BAGS / 'lost_samples'), '--out', str(out)]) == 0
-    assert out.read_bytes().startswith(magic)
-    printed = capsys.readouterr().out
-    # 4000 were taken (bags/make.py); of the 176 that are missing one is the very last, which no one can know of.
-    assert '3824 present, 175 lost (4.38 %)' in printed
-    assert '192 of 193 blocks' in printed
-    assert 'too few samples' in printed
-
-
 def content_of(page: Path) -> dict[str, Any]:
     """The data in an interactive page."""
     found = re.search(r'<script type="application/json" id="recording">(.*?)</script>', page.read_text(), re.S)

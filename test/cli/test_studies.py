@@ -106,14 +106,6 @@ def test_the_rig_file_is_the_one_that_was_given_and_corrects(made: Path, tmp_pat
     assert errors['after'] < 0.1 * errors['before']
 
 
-def test_the_check_of_the_same_rig_holds(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['calibrate', str(made / 'run.csv'), '--check', str(made / 'out' / 'rig.yaml'), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found['verdict'] == 'holds'
-    assert found['moved'] is None
-    assert set(found['zero']) == {'psd_1.zero_x', 'psd_1.zero_y', 'psd_2.zero_x', 'psd_2.zero_y'}
-
-
 @pytest.mark.parametrize(
     ('argv', 'status', 'words'),
     [

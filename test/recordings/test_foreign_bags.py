@@ -135,33 +135,6 @@ def test_another_rig_in_the_same_bag_is_reported(tmp_path: Path) -> None:
     assert any('another rig starts' in w for w in recording.warnings)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    'command',
-    [['replay'], ['replay', '--compare'], ['plot', '--out', 'p.png'], ['convert', '--out', 'c.mcap'], ['discover']],
-)
-def test_every_command_says_that_it_takes_the_nominal_rig(
-    run: Path, tmp_path: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    bare = passed_on(run, tmp_path / 'bare', keep=lambda topic, _: topic != RIG)
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    link:\n      length: 0.6\n')
-    if command == ['discover']:
-        # It has no loads: the rig is read before they are missed.
-        argv = ['discover', str(bare), '--out', 'found']
-        assert main(argv) != 0
-    else:
-        argv = [command[0], str(bare), *command[1:]]
-        assert main(argv) == (1 if '--compare' in command else 0)
-    answer = capsys.readouterr()
-    assert 'lacks parameters: the nominal rig is taken if no rig file is given' in answer.err
-    assert ('evaluated with the nominal one' in answer.out) == ('--compare' in command)
-    (tmp_path / 'c.mcap').unlink(missing_ok=True)
-    main([*argv, '--params-file', str(rig)])
-    assert 'nominal' not in ''.join(capsys.readouterr())
-
-
 def test_what_both_hold_is_compared(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = ('/psd/samples', '/link_tip/deflection', RIG)
 

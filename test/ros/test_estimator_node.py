@@ -14,8 +14,6 @@ import signal
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
     PointStamped,
     PoseStamped,
@@ -31,10 +29,8 @@ from geometry_msgs.msg import (
     Vector3Stamped,
     WrenchStamped,
 )
-from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
@@ -305,83 +301,7 @@ def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., An
 
 
 @pytest.mark.slow
-def test_second_rig_in_namespace_runs_at_stopped_clock(start: Callable[..., Any], peer: Any) -> None:
-    pytest.importorskip('aiohttp')
-    options = {'use_sim_time': True, 'markers': True, 'monitor': True, 'monitor_port': 0, 'monitor_control': True}
-    arguments = [word for name, value in options.items() for word in ('-p', f'{name}:={str(value).lower()}')]
-    remaps = ('-r', '__ns:=/left', '-r', '/left/psd_1/spot:=/spot')
-    daemon = start('--ros-args', *remaps, *arguments)
-    poses = peer.collect(PoseStamped, '/left/link_tip/deflection')
-    spots = peer.collect(PointStamped, '/spot')
-    markers = peer.collect(MarkerArray, '/left/link_tip/markers')
-    log = peer.collect(Log, '/rosout', QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-    health = peer.collect(DiagnosticArray, '/diagnostics')
-    # Health and markers come although nobody publishes /clock.
-    peer.until(lambda: min(len(poses), len(spots)) >= 30 and len(markers) >= 3, 'the second rig')
-    peer.until(lambda: len(health) >= 2, 'its health')
-    assert not [topic for topic, _ in peer.node.get_topic_names_and_types() if topic.startswith(('/link_tip', '/psd'))]
-    assert {s.name for s in health[-1].status} >= {'left/estimator: acquisition', 'left/estimator: clock'}
-    (acquired,) = [s for s in health[-1].status if s.name == 'left/estimator: acquisition']
-    assert acquired.level == DiagnosticStatus.WARN
-    request = GetParameters.Request(names=['simulated'])
-    assert peer.call(GetParameters, '/left/estimator/get_parameters', request).values[0].bool_value
-    assert {s.hardware_id for s in health[-1].status} == {'SIM-0001'}
-    assert abs(stamp(health[-1]) - stamp(poses[-1])) < 60 * 10**9
-    # What the terminal shows is on /rosout as well.
-    daemon.until('frames have no prefix')
-    text = 'publishing on ROS domain'
-    peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(text) for m in log), 'its log')
-    levels = {m.msg.partition(' ')[0]: m.level for m in log}
-    # 20 is information, 30 a warning: simulated data must not pass for measured.
-    assert (levels['publishing'], levels['no'], levels['use_sim_time']) == (20, 30, 30)
-    assert 'no port given' in daemon.until(r'\[WARN\] (no port.*)')[1]
-    assert ('simulated', 'yes') in {(v.key, v.value) for s in health[-1].status for v in s.values}
-    # Whose estimates would be mixed with somebody else's hears of it.
-    peer.node.create_publisher(PoseStamped, '/left/link_tip/deflection', 10)
-    daemon.until('another node publishes on /left/link_tip/deflection too')
-    # A zero that the page takes can be read where one that ROS takes can.
-    url = daemon.until(r'monitor: (http\S+)')[1]
-    headers = {'Content-Type': 'application/json'}
-
-    def zeroed() -> bool:
-        """While the link rings under the simulated load, the zero is rejected with status 409."""
-        try:
-            with urllib.request.urlopen(urllib.request.Request(url + 'api/zero', b'{}', headers), timeout=60.0) as got:
-                return bool(json.load(got)['ok'])
-        except urllib.error.HTTPError as error:
-            if error.code != 409:
-                raise
-            return False
-
-    peer.until(zeroed, 'a zero of a link at rest')
-    # A load of another node is known to the page; what is noted there acts beside it.
-    weights = peer.node.create_publisher(WrenchStamped, '/left/link_tip/load', 10)
-    peer.until(lambda: weights.get_subscription_count() > 0, 'the subscription to loads')
-    applied = WrenchStamped()
-    applied.wrench.force.y = -10.0
-
-    def annotated(fy: float) -> str:
-        body = json.dumps({'fx': 0, 'fy': fy, 'tz': 0, 'add': True}).encode()
-        with urllib.request.urlopen(urllib.request.Request(url + 'api/load', body, headers), timeout=60.0) as answer:
-            return str(json.load(answer)['message'])
-
-    def known() -> bool:
-        # Matched on this side only at first: it may be lost.
-        weights.publish(applied)
-        return 'Fy -10 N' in annotated(0.0)
-
-    peer.until(known, 'the load')
-    assert 'Fy -15 N' in annotated(-5.0)
-    request = GetParameters.Request(names=['psd_1.zero'])
-
-    def shown() -> list[float]:
-        return list(peer.call(GetParameters, '/left/estimator/get_parameters', request).values[0].double_array_value)
-
-    peer.until(lambda: shown() != [0.0, 0.0], 'the zero among the parameters')
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('signals', [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
+@pytest.mark.parametrize('signals', [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
 def test_signals_end_it_and_leave_a_whole_recording(
     start: Callable[..., Any], peer: Any, tmp_path: Path, signals: list[int]
 ) -> None:

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -22,7 +20,6 @@ from psd_deflection.ros.endpoints import qos
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic
 from test.ros.test_conformance import nodes_of_setup
-from tools.program import ROOT, WAIT_S
 
 pytestmark = pytest.mark.ros
 
@@ -167,26 +164,5 @@ def test_unreliable_load_publisher_is_rejected_by_name(
     assert 'a publisher is best effort, and this has to be reliable' in gated.logged[0]
 
 
-ENDED = """
-import sys
-from bench.campaign.messages import main
-from psd_deflection.arms.inputs import KnownJoints
-def broken(*_):
-    raise RuntimeError('a defect')
-KnownJoints.notify = broken
-sys.exit(main())
-"""
-
-
 def test_every_node_is_attacked() -> None:
     assert set(NODES) == set(nodes_of_setup())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('script', 'wanted'), [('', 0), (ENDED, 1)])
-def test_a_node_that_holds_and_one_that_ends(domain: int, script: str, wanted: int) -> None:
-    command = ['-c', script] if script else ['-m', 'bench.campaign.messages']
-    words = [sys.executable, *command, '300', '--node', 'shaper', '--dds', '0']
-    ended = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
-    assert ended.returncode == wanted, ended.stderr[-3000:]
-    assert ('EndedError' in ended.stderr) == bool(script)

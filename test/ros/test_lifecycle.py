@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Log, ParameterValue
@@ -214,49 +214,6 @@ def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], devic
     daemon.send(number)
     assert daemon.wait() == 0, daemon.lines
     assert not any('Traceback' in line for line in daemon.lines)
-
-
-@pytest.mark.slow
-def test_the_zero_holds_for_the_next_run(
-    start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
-) -> None:
-    arguments = ('--port', simulated_port, '--ros-args', '-p', f'zero_file:={tmp_path / "zero.json"}')
-    first = start(*arguments)
-    poses = peer.collect(PoseStamped, '/link_tip/deflection')
-    wrenches = peer.collect(WrenchStamped, '/link_tip/wrench')
-    peer.until(lambda: len(poses) >= 30 and len(wrenches) >= 30, 'estimates')
-    put = Parameter('psd_1.zero', value=[0.0002, 0.0001]).to_parameter_msg()
-    answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
-    assert answer.results[0].successful
-    first.until(r'changed: psd_1.zero = \[0.0002, 0.0001\]')
-    peer.until_of_now(poses, 'estimates after the change')
-    assert abs(poses[-1].pose.position.x) > 5e-5
-    peer.zero()
-    taken = parameters(peer, 'psd_1.zero', 'psd_2.zero')
-    assert taken[0] != [0.0002, 0.0001]
-    assert taken != [[0.0, 0.0], [0.0, 0.0]]
-    first.send(signal.SIGINT)
-    assert first.wait() == 0, first.lines
-    second = start(*arguments)
-    second.until('zero of the last run')
-    second.until('publishing on ROS domain')
-    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken
-    second.send(signal.SIGINT)
-    assert second.wait() == 0, second.lines
-    # Switched off, the rig file holds.
-    third = start(*arguments, '-p', 'keep_zero:=false')
-    third.until('publishing on ROS domain')
-    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == [[0.0, 0.0], [0.0, 0.0]]
-
-
-@pytest.mark.slow
-def test_a_shutdown_ends_the_daemon(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
-    daemon = start('--port', simulated_port)
-    daemon.until('publishing on ROS domain')
-    assert change(peer, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-    daemon.until('shut down by change_state')
-    assert daemon.wait() == 0, daemon.lines
-    SerialPort(simulated_port, 921_600).close()
 
 
 def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:

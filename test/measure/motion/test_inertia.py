@@ -163,28 +163,6 @@ def moved(records: list[Record]) -> list[TipMotion]:
     return [r for r in records if isinstance(r, TipMotion)]
 
 
-def off(run: motion.Run, motions: list[TipMotion]) -> tuple[float, float]:
-    """Rms error of the velocity along y from the second block of motion on, and what the filter says of it."""
-    part = motions[26:]
-    errors = np.array([m.vy - run.velocity[round(m.t_ns / MS), 1] for m in part])
-    return motion.rms(errors), motion.rms(np.sqrt([m.velocity_covariance[4] for m in part]))
-
-
-@pytest.mark.slow
-def test_the_filter_foretells_what_a_turning_joint_does(run: motion.Run) -> None:
-    reported, untold = Pipeline(motion.rig_of()), Pipeline(motion.rig_of())
-    with_it, own = off(run, moved(through(reported, run, range(100))))
-    without, _ = off(run, moved(through(untold, run, range(100), reported=[])))
-    assert with_it < 0.4 * without
-    assert with_it < 1.1 * own
-    # To now: the acceleration goes on.
-    assert reported.motion_filter is not None
-    assert reported.motion_filter.inertia.late == 0
-    before = reported.motion_filter.predicted(np.array([0.0, 0.020]))
-    step = before.velocity[1, 1] - np.array(MODES[1].step(0.020)[1] @ reported.motion_filter._x[1]) * MODES[1].w
-    assert abs(step) == pytest.approx(4.0 * L / MODES[1].w * MODES[1].pushed(np.array([0.02]))[0, 0, 1], rel=1e-9)
-
-
 def test_lost_lasers_are_coasted_through_with_what_is_reported(run: motion.Run) -> None:
     dark = motion.Run(run.loads, run.pose, run.velocity, run.volts.copy(), run.reported)
     # A turn of the acceleration is in it.

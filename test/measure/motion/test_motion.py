@@ -61,39 +61,6 @@ def test_velocity_prediction_and_innovations(kind: str, evaluated: dict[str, mot
 
 
 @pytest.mark.slow
-def test_the_covariance_of_the_pose_is_that_of_its_errors() -> None:
-    run = motion.make('operation', 10.0, 6)
-    moved = through(Pipeline(RIG), run, range(500))[150:]
-    errors = np.array([pose(m) - truth(run, m) for m in moved])
-    stated = np.mean([np.reshape(m.covariance, (3, 3)) for m in moved], axis=0)
-    found = errors.T @ errors / len(errors)
-    scale = np.sqrt(np.outer(np.diag(stated), np.diag(stated)))
-    # The readings are shared: x and twist err together.
-    assert abs(stated / scale)[0, 2] > 0.2
-    np.testing.assert_allclose(found / scale, stated / scale, atol=0.3)
-
-
-@pytest.mark.slow
-def test_truth_after_100_ms_gap_is_within_three_sd(operation: motion.Run) -> None:
-    beyond = []
-    pipeline = Pipeline(RIG)
-    filtered = pipeline.motion_filter
-    assert filtered is not None
-    for first in range(160, 380, 20):
-        before = through(pipeline, operation, range(0 if first == 160 else first - 20, first))[-1]
-        predicted = filtered.predicted(np.arange(1.0, 101.0) / 1000.0)
-        ahead = slice(20 * first, 20 * first + 100)
-        beyond.append(np.abs(predicted.pose - operation.pose[ahead]) / np.sqrt(predicted.variance))
-        assert predicted.variance[-1, 0] > 4.0 * predicted.variance[0, 0]
-    assert np.mean(np.concatenate(beyond) < 3.0) > 0.99
-    # Samples come back: the filter goes on, and does not begin anew.
-    after = through(pipeline, operation, range(first + 5, first + 6))[-1]
-    assert filtered.predictions_only == 1
-    assert np.all(np.abs(pose(after) - truth(operation, after)) < 5.0 * np.sqrt(after.covariance[::4]))
-    assert after.covariance[0] < 100.0 * before.covariance[0]
-
-
-@pytest.mark.slow
 def test_a_lost_laser_is_coasted_through_and_reported(operation: motion.Run) -> None:
     dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
     dark.volts[4000:4100, 2] = 0.0
@@ -130,22 +97,6 @@ def test_ahead_is_the_prediction(operation: motion.Run) -> None:
     np.testing.assert_allclose(velocity(there), predicted.velocity[0], rtol=1e-9)
     np.testing.assert_allclose(there.covariance[::4], predicted.variance[0], rtol=1e-9)
     assert np.all(np.abs(pose(there) - truth(operation, there)) < 4.0 * np.sqrt(there.covariance[::4]))
-
-
-@pytest.mark.slow
-def test_a_known_load_is_foretold() -> None:
-    run = motion.make('steps', 6.0, 11)
-    reported, untold = Pipeline(RIG), Pipeline(RIG)
-    changes = np.flatnonzero(np.any(np.diff(run.loads, axis=0), axis=1)) + 1
-    reported.load(AppliedLoad(0, 0.0, 0.0, 0.0))
-    for i in changes.tolist():
-        assert reported.load(AppliedLoad(i * 1_000_000, *run.loads[i].tolist())) is not None
-    with_load, without = (through(p, run, range(300))[150:] for p in (reported, untold))
-    off, blind = (
-        motion.rms(np.array([velocity(m) - run.velocity[round(m.t_ns / 1e6)] for m in moved])[:, :2])
-        for moved in (with_load, without)
-    )
-    assert off < 0.5 * blind
 
 
 @pytest.mark.parametrize('start', [151, 203, 260])

@@ -293,15 +293,6 @@ def swaying(size: int, lost: tuple[int, ...] = ()) -> FloatArray:
     return np.array([(r.dy - 3e-4 * np.sin(88.0e-9 * r.t_ns + 0.3)) / r.covariance[4] ** 0.5 for r in found])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('size', [5, 6, 8, 11])
-def test_small_blocks_follow_motion_and_say_how_well(size: int) -> None:
-    """With one order for four samples 0.31 of the intervals of blocks of 8 held the truth."""
-    z = np.abs(swaying(size))
-    assert np.mean(z < 1.959964) == pytest.approx(0.95, abs=0.02)
-    assert np.mean(z < 3.0) > 0.99
-
-
 def test_blocks_losing_their_end_cover_their_error() -> None:
     """Weights of some 1e-5 a block are weights: 0.93 were within three deviations, and the rms error was 6 um."""
     assert np.mean(np.abs(swaying(20, tuple(range(12, 20)))) < 3.0) > 0.99

@@ -10,7 +10,6 @@ import pytest
 
 from blind.coverage import Row, coarse, motion, volts_of
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.measure.uncertainty.block_fit import BlockFit
 from psd_deflection.measure.uncertainty.converter import ConverterSteps
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise, undithered
 from psd_deflection.records import FloatArray
@@ -159,41 +158,6 @@ def test_gaps_take_nothing_off_the_colour_of_hum() -> None:
     # What is sure alone has 5 % too much at lag 0: the rest of it is as it is.
     assert abs(own[0] / hum[0] - 1.0) < 0.015
     np.testing.assert_allclose(own, hum, atol=0.07)
-
-
-def _odd(name: str) -> FloatArray:
-    """Streams that no rig has and that a device may send, (n, 4), m."""
-    t = np.arange(6 * SEGMENT)
-    one = {
-        'constant': 0.0 * t,
-        'every other': SIGMA * (-1.0) ** t,
-        'hum alone': 10.0 * SIGMA * np.sin(0.333 * t),
-        'one block long': 10.0 * SIGMA * np.sin(2.0 * np.pi * t / SIZE),
-        'steps': 10.0 * SIGMA * (t // 7 % 2),
-        'spikes': 1e-3 * (t % 333 == 0),
-        'walk': coloured(len(t), 0.0, 21)[:, 0].cumsum(),
-    }[name]
-    # The four say the same: some combinations of them have no noise at all.
-    return np.stack([one, -one, one, one], axis=1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('lost', [0, 5, 18])
-@pytest.mark.parametrize('step', [0.0, STEP])
-@pytest.mark.parametrize('name', ['constant', 'every other', 'hum alone', 'one block long', 'steps', 'spikes', 'walk'])
-def test_no_stream_ends_the_estimates(name: str, step: float, lost: int) -> None:
-    noise, fit = stream(step), BlockFit(SIZE, PLACES, PLACES)
-    fit.set_noise(noise.gamma)
-    rng = np.random.default_rng(22)
-    for b, block in enumerate(_odd(name).reshape(-1, SIZE, 4)):
-        slots = np.sort(rng.choice(SIZE, SIZE - lost, replace=False))
-        fitted = fit.fit(slots, block[slots])
-        # The mean of the block, or what the polynomial makes of it: no number that came of dividing by nothing.
-        assert np.abs(fitted.dots - block[slots].mean(axis=0)).max() <= 3.0 * np.ptp(block[slots]) + 1e-12
-        assert np.linalg.eigvalsh(fitted.covariance)[0] > 0.0
-        if noise.add(b, slots, block[slots]):
-            assert (noise.mean_sd() > 0.0).all()
-            fit.set_noise(noise.gamma)
 
 
 def test_what_remembers_nothing_goes_on_as_from_the_start() -> None:

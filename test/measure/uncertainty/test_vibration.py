@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from blind import generator
-from blind.coverage import LOSSES, ROWS, Row, motion, rig, shaken, volts_of
+from blind.coverage import ROWS, Row, shaken, volts_of
 from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_estimator import VIBRATION
 from psd_deflection.measure.uncertainty.block_fit import BlockFit
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
 from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_of, words_of
-from psd_deflection.records import FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
+from psd_deflection.records import FloatArray, IntArray, RawChunk, Record, TipMotion
 from psd_deflection.rig.config import Rig, load_rig
 
 SIZE, RATE = 20, 1000.0
@@ -126,22 +126,6 @@ def test_a_vibration_is_counted_and_named(hz: float) -> None:
     assert s.inside.rms[1] > s.sd[1] / 1.2
     assert s.named == 1.0
     assert s.words == f'vibrates: 14 µm rms near {hz:g} Hz'
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('label', [row.label for row in ROWS])
-@pytest.mark.parametrize('loss', ['none', '20 %'])
-def test_it_does_not_fire(label: str, loss: str) -> None:
-    """At rest, at the steps of 50 N and while the link rings, with every kind of noise; hum is in the sums as well."""
-    row = next(r for r in ROWS if r.label == label)
-    clean, _ = motion(12, 2)
-    share, burst = LOSSES[loss]
-    here = np.flatnonzero(generator.present(len(clean), 1, share, burst))
-    volts = volts_of(row, clean, 2)
-    arrived = RawChunk(here, here * 1_000_000, volts[here].astype(np.float32), np.zeros(len(here), np.uint8))
-    spots = [r for r in Pipeline(rig(row)).process(arrived) if isinstance(r, SpotMeans)]
-    assert len(spots) > 1000
-    assert not [f for s in spots for f in s.findings if f.startswith('vibrates')]
 
 
 def shaking(seconds: int, hz: float = 87.0) -> FloatArray:

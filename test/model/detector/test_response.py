@@ -4,9 +4,7 @@
 
 from __future__ import annotations
 
-import ast
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import psd_deflection
 from psd_deflection.model.detector.response import DetectorResponse, compensated, pulled
-from psd_deflection.model.simulation.catalogue import effect_names, make_active
+from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
@@ -24,7 +21,6 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.budget.chain import MeasuringChain, measure
 
-PACKAGE = Path(psd_deflection.__file__).parent
 RIG = load_rig()
 SUM = RIG.amplifier.sum_nominal
 share = st.floats(-0.05, 0.05)
@@ -127,36 +123,3 @@ def test_beyond_the_fold_the_inverse_is_a_straight_line(k: float) -> None:
 def test_light_is_taken_off_again(x: float, level: float, center: float) -> None:
     read = pulled(np.array(x), SUM, level, center)
     assert compensated(read, SUM, level, center) == pytest.approx(x, abs=1e-17)
-
-
-HOMONYMS = {
-    'damping': 'a setting of the compensator and its least squares',
-    'quantisation': 'a cause of the error budget',
-    'plane_tilt': 'a cause of the error budget',
-    'refraction': 'a cause of the error budget',
-    'sensor_gain': 'a cause of the error budget',
-    'sensor_rotation': 'a cause of the error budget',
-    'spot_clipping': 'a cause of the error budget',
-    'thermal_drift': 'a cause of the error budget',
-    'bending_stiffness': 'EI in the table of `design`',
-    'torsional_stiffness': 'GJ in the table of `design`',
-}
-PLACES = ('studies/budget/', 'arms/', 'cli/run/compensator.py', 'cli/studies/design.py')
-"""Where these words stand for something else."""
-
-
-@pytest.mark.slow
-def test_no_other_file_names_an_effect() -> None:
-    names = set(effect_names())
-    assert len(names) >= 30
-    found = []
-    for path in sorted(PACKAGE.rglob('*.py')):
-        where = path.relative_to(PACKAGE).as_posix()
-        if where.startswith('model/simulation/effects/'):
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if not isinstance(node, ast.Constant) or node.value not in names:
-                continue
-            if not (where.startswith(PLACES) and node.value in HOMONYMS):
-                found.append(f'{where}:{node.lineno}: {node.value}')
-    assert found == []

@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
 
-from psd_deflection.cli.main import main
 from psd_deflection.records import AppliedLoad, BlockStatus
 from tools.accessible import views, violations
 
@@ -19,8 +17,6 @@ from .browsing import Page
 from .serving import BLOCK_NS, START_NS, Serving
 
 pytestmark = pytest.mark.browser
-
-BAGS = Path(__file__).parents[3] / 'bags'
 
 
 @pytest.fixture(scope='module')
@@ -58,12 +54,6 @@ def test_the_live_page(page: Page, shown: Serving) -> None:
 
 
 @pytest.mark.slow
-def test_the_live_page_when_no_samples_come(page: Page, shown: Serving) -> None:
-    page.open(shown.url)
-    audit(page, 'document.body.dataset.state === "stale" && document.querySelectorAll("#entries details").length > 0')
-
-
-@pytest.mark.slow
 def test_the_live_page_with_all_that_opens(page: Page, shown: Serving) -> None:
     shown.give(105, 1, status=BlockStatus.LASER_LOST)
     page.open(shown.url)
@@ -75,33 +65,3 @@ def test_the_live_page_with_all_that_opens(page: Page, shown: Serving) -> None:
         page.js(f'document.getElementById("{what}").showModal()')
         assert violations(page.driver) == []
         page.driver.refresh()
-
-
-@pytest.mark.slow
-def test_the_page_of_a_recording(page: Page, tmp_path: Path) -> None:
-    out = tmp_path / 'recording.html'
-    assert main(['plot', str(BAGS / 'laser_off'), '--out', str(out)]) == 0
-    page.open(out.as_uri())
-    audit(page, 'document.querySelectorAll(".uplot").length === 4')
-    assert page.complaints() == []
-
-
-@pytest.mark.slow
-def test_the_report_of_discover(page: Page, tmp_path: Path) -> None:
-    recording, out = tmp_path / 'run.csv', tmp_path / 'found'
-    hidden = ['--effect', 'sensor_rotation,psd=1,angle=0.01']
-    loads = ['--loads', 'steps:0,0,0;0,-10,-5.85;10,0,0:0.6']
-    assert main(['simulate', '--out', str(recording), *loads, *hidden]) == 0
-    assert main(['discover', str(recording), '--params-file', 'config/thesis_rig.yaml', '--out', str(out)]) == 0
-    page.open((out / 'report.html').as_uri())
-    audit(page, 'document.querySelectorAll(".uplot").length >= 8')
-    page.driver.execute_cdp_cmd(
-        'Emulation.setDeviceMetricsOverride', {'width': 390, 'height': 844, 'deviceScaleFactor': 1, 'mobile': True}
-    )
-    try:
-        # Readable on a phone: as wide as it, and no wider.
-        assert page.js('window.innerWidth') == 390
-        assert page.js('document.documentElement.scrollWidth') <= 390
-        assert page.complaints() == []
-    finally:
-        page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})

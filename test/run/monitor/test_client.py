@@ -233,27 +233,7 @@ def test_without_a_daemon_the_error_says_how_to_start_one(
     assert output.count('\n') == 1
 
 
-def started(program: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """A program of Python that has ended well."""
-    command = [sys.executable, '-c', program, *words]
-    return subprocess.run(command, cwd=ROOT, text=True, capture_output=True, timeout=WAIT_S, check=True)
-
-
 HEAVY = ('scipy', 'aiohttp', 'matplotlib', 'ruamel')
-
-
-@pytest.mark.slow
-def test_a_mark_and_a_load_say_how_long_ago_they_were_typed(serve: Serve) -> None:
-    serving = serve()
-    # What it imports first stands for a slow start: how long that took, it prints.
-    program = (
-        'import sys, time; begun = time.monotonic(); import scipy.stats; print(time.monotonic() - begun)\n'
-        'from psd_deflection.cli.main import main; sys.exit(main(sys.argv[1:]))'
-    )
-    took = []
-    for words in (['mark', 'x'], ['load', '0', '0', '0']):
-        took.append(float(started(program, *words, '--url', serving.url).stdout.split()[0]))
-    assert all(start < late < WAIT_S for start, late in zip(took, serving.shown.lates, strict=True))
 
 
 @pytest.mark.parametrize('text', ['-1,5', '1_0', 'ten'])

@@ -198,13 +198,3 @@ def test_estimates_are_free_of_light_and_of_offsets(nominal: Rig) -> None:
     assert before > 30e-6
     assert after < 2.5e-6
     assert after < 1.2 * lit_poses(nominal, (misaligned.DARK, misaligned.DARK), 5) + 0.3e-6
-
-
-@pytest.mark.slow
-def test_a_calibration_in_the_light_of_a_room_covers_in_another() -> None:
-    """The campaign with --light has more rigs."""
-    scores = [campaign.score(seed, lit=True) for seed in (2, 6, 8)]
-    total = campaign.summary(scores)
-    assert total.worse == 0
-    assert total.poses > 0.8
-    assert max(float(s.after[:2].max()) for s in scores) < 3e-6

@@ -21,9 +21,8 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import Rig, load_rig, rig_from_values
+from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import read_parameter_file
-from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
@@ -126,9 +125,8 @@ def test_each_of_127_wrong_wirings_is_named_from_three_pushes() -> None:
     assert not misnamed
 
 
-@pytest.mark.parametrize('seeds', [range(2), pytest.param(range(2, 20), marks=pytest.mark.slow)])
-def test_a_right_rig_is_accused_by_none_of_20_seeds(seeds: range) -> None:
-    for size, seed in itertools.product((10.0, 10.0 * BLOCK), seeds):
+def test_a_right_rig_is_accused_of_nothing() -> None:
+    for size, seed in itertools.product((10.0, 10.0 * BLOCK), range(2)):
         loads = pushes(size)
         found = checked(recorded(loads, seed), loads)
         assert (found.verdict, found.findings, dict(found.values)) == (RIGHT, (), {})
@@ -155,27 +153,6 @@ def test_a_right_wiring_beside_other_mistakes_is_not_accused(effects: list[Any])
         found = checked(recorded(loads, seed, effects=effects), loads)
         assert found.verdict == RIGHT, found.findings
         assert not found.values
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('noise', [{'memory': 0.9}, {'heavy': True}, {'sigmas': (1e-3, 2e-3, 2e-3, 3e-3, 2e-3, 2e-3)}])
-def test_coloured_heavy_and_unequal_noise_accuse_no_wiring(noise: dict[str, Any]) -> None:
-    loads = pushes(30.0)
-    for seed in range(5):
-        found = checked(recorded(loads, seed, **noise), loads)
-        assert [f.name for f in found.findings if f.name != 'noise_level'] == []
-        assert [c.wiring for c in found.wirings] == [Wiring()]
-
-
-@pytest.mark.slow
-def test_the_nominal_file_of_a_rewired_rig_is_wrong() -> None:
-    loads = pushes(10.0)
-    for seed, turn in enumerate(every_turn()[1::9]):
-        rig = rig_from_values(lines_of(turn))
-        assert checked(recorded(loads, seed, turn), loads, rig).verdict == RIGHT
-        nominal = checked(recorded(loads, seed), loads, rig)
-        assert nominal.verdict == WRONG
-        assert rig_from_values({**lines_of(turn), **nominal.values}).values == load_rig().values
 
 
 @pytest.mark.slow
@@ -331,19 +308,6 @@ def drift_of(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> d
     main(['check', made, '--json'])
     answer: dict[str, Any] = json.loads(capsys.readouterr().out)
     return answer
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('seed', ['1', '2'])
-@pytest.mark.parametrize('loads', SWAYS)
-def test_loads_and_ringing_are_no_drift(
-    loads: str, seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = drift_of(tmp_path, capsys, '--loads', loads, '--seed', seed)
-    for channel, drift in found['drift'].items():
-        assert abs(drift) < 4.0 * found['drift_sd'][channel]
-        assert found['drift_sd'][channel] < 1e-6 / 60.0
-    assert not any('drift' in note for note in found['notes'])
 
 
 def test_drift_under_load_steps_is_found_to_1_percent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

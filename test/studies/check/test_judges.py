@@ -21,28 +21,6 @@ from psd_deflection.studies.check.levels import levels
 RIG = load_rig()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(('noise', 'reported'), [(0.0034, False), (0.006, True), (0.0007, True)])
-def test_check_and_discover_say_the_same_of_the_noise(
-    noise: float, reported: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, found = tmp_path / 'run.csv', tmp_path / 'found'
-    world = ['--world', f'amplifier.noise={noise}']
-    assert main(['simulate', '--out', str(run), '--loads', 'thesis:1', *world]) == 0
-    assert main(['discover', str(run), '--out', str(found), '--quiet']) == 0
-    capsys.readouterr()
-    assert main(['check', str(run), '--json']) == 0
-    checked = json.loads(capsys.readouterr().out)['setup']
-    searched = json.loads((found / 'result.json').read_text())['setup']
-    levels = [[f for f in message if f['name'] == 'noise_level'] for message in (checked, searched)]
-    assert [len(one) for one in levels] == [reported, reported]
-    if reported:
-        (of_check,), (of_search,) = levels
-        assert of_check['value'] == pytest.approx(of_search['value'], rel=0.03)
-        levels_reported = [float(f['fix'].removeprefix('amplifier.noise: ')) for f in (of_check, of_search)]
-        assert levels_reported == pytest.approx([noise, noise], rel=0.05)
-
-
 NAN = math.nan
 
 

@@ -14,7 +14,6 @@ import pytest
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.free_loads import refitted
@@ -29,7 +28,6 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.applied import ringing_on, unseen
 from psd_deflection.studies.discover.setup.redundant import excess
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
-from psd_deflection.studies.loads.steps import applied
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, read
 
 ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
@@ -37,20 +35,6 @@ ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects
 
 def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
     return discover([Observation('x', RIG, volts, annotated)])
-
-
-@pytest.mark.slow
-def test_rounded_loads_are_reported_beside_effect() -> None:
-    odd = LEVELS + np.array(
-        [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
-    )
-    found = searched(read(np.repeat(odd, DWELL, axis=0), **ROTATED), HELD)
-    assert [f.where for f in found.setup] == [f'load {i}' for i in range(1, 7)]
-    assert {f.name for f in found.setup} == {'load_value'}
-    assert '(38.9 N, -37.6 N, 20 N m) hung' in found.setup[4].fix
-    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
-    assert found.verdict == 'effects_found'
-    assert found.law is None
 
 
 @pytest.mark.slow
@@ -66,30 +50,8 @@ def test_amplifier_lag_is_found_beside_fitted_times() -> None:
     assert found.floors < 1.1
 
 
-ROUNDED = np.array(
-    [(0, 0, 0), (0, -50, 0), (5, -10, 0), (0, -35, 0), (20, -30, 18), (0, -25, -14), (30, -50, 0), (0, 0, 0)], float
-)
-"""As annotated; what hung is nearly in proportion."""
 OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
-
-
-@pytest.mark.slow
-def test_proportional_rounded_loads_are_checked_first() -> None:
-    found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0)), np.repeat(ROUNDED, DWELL, axis=0))
-    assert [(f.name, f.where) for f in found.setup] == [('load_value', f'load {i}') for i in range(1, 7)]
-    assert '(31.03 N, -51.71 N, 0 N m) hung, not (30 N, -50 N, 0 N m)' in found.setup[5].fix
-    assert found.verdict == 'nothing_missing'
-    assert found.simulations <= 600
-
-
-@pytest.mark.slow
-def test_the_noise_of_a_load_cell_is_no_effect() -> None:
-    noise = np.random.default_rng(1).normal(size=HELD.shape) * (0.05, 0.05, 0.01)
-    found = searched(read(HELD), HELD + noise)
-    assert found.verdict == 'nothing_missing'
-    assert not found.setup
-    assert found.floors < 1.05
 
 
 @pytest.mark.slow
@@ -104,7 +66,7 @@ def test_link_effect_blames_no_detector_or_estimate() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.02, 1.0), (1.0, 0.97), (0.96, 1.05)])
+@pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.0, 0.97)])
 def test_other_natural_frequencies_are_rig_file_lines(bending: float, torsion: float) -> None:
     true = {'dynamics__bending_frequency': 14.0 * bending, 'dynamics__torsion_frequency': 21.0 * torsion}
     found = searched(read(HELD, **true), HELD)
@@ -125,51 +87,7 @@ def test_other_natural_frequencies_are_rig_file_lines(bending: float, torsion: f
 
 
 @pytest.mark.slow
-def test_lower_bending_frequency_alone_may_be_tip_mass() -> None:
-    found = searched(read(HELD, dynamics__bending_frequency=14.0 * 0.97), HELD)
-    assert [(e.name, e.equivalent) for e in found.effects] == [('tip_mass', ('bending_frequency',))]
-    assert found.setup == ()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('step', [0.01, 0.07])
-def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
-    volts = read(HELD)
-    dots = [0, 1, 3, 4]
-    volts[:, dots] = np.rint(volts[:, dots] / step) * step
-    found = searched(volts, HELD)
-    assert [(e.name, e.values['sums']) for e in found.effects] == [('quantisation', 0.0)]
-    assert found.effects[0].values['step'] == pytest.approx(step, rel=1e-5)
-    assert [(f.name, f.where) for f in found.setup] == [('converter_step', c) for c in ('x1', 'y1', 'x2', 'y2')]
-    # A line for the bits would make the sums coarse, too.
-    assert not any(f.fix.startswith('converter.bits') for f in found.setup)
-    assert found.verdict == 'effects_found'
-    assert found.law is None
-    # With the model that has them, nothing is missing: no noise, no steps.
-    own = replace_values(RIG, {f'effects.q.{name}': v for name, v in found.effects[0].values.items()})
-    again = discover([Observation('x', replace_values(own, {'effects.q.name': 'quantisation'}), volts, HELD)])
-    assert (again.verdict, again.setup, again.effects) == ('nothing_missing', (), ())
-    assert [a.effect.name for a in again.known] == ['quantisation']
-    assert again.floors < 1.1
-
-
-@pytest.mark.slow
-def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
-    """What is found first is a stiffness; beside the delay, which is better, the clamp is looked for again."""
-    levels = np.array([(0, 0, 0), (0, -50, 0), (0, -20, 0), (0, -40, 0), (20, -30, 17.55), (-25, -15, 0), (0, -40, 0)])
-    acting = np.repeat(np.vstack((levels, np.zeros(3))), DWELL, axis=0).astype(np.float64)
-    soft = {'effects__e__name': 'clamp_torsional_compliance', 'effects__e__compliance': 1.56e-5}
-    annotated = np.vstack((np.zeros((4, 3)), acting[:-4]))
-    found = searched(read(acting, **soft), annotated)
-    assert [f.name for f in found.setup] == ['load_delay']
-    assert found.setup[0].value == pytest.approx(0.004, abs=1e-5)
-    # One torque cannot tell the clamp from the link.
-    assert [e.active.effect.name for e in found.effects] in [['clamp_torsional_compliance'], ['torsional_stiffness']]
-    assert (found.verdict, found.unknown) == ('effects_found', ())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (2, 0.02), (5, 0.02), (2, 0.06)])
+@pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (5, 0.06)])
 def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
     annotated = np.vstack((np.zeros((late, 3)), HELD[:-late]))
@@ -220,23 +138,6 @@ def test_free_times_are_settled_again_if_an_effect_fails() -> None:
     assert refitted(same) is same
 
 
-@pytest.mark.slow
-def test_ringing_link_under_slow_loads_has_its_damping() -> None:
-    """What rings outlasts what is left out, and a search begins far from it."""
-    t = np.arange(len(HELD)) / 1000.0
-    acting = np.tile(LEVELS[0], (len(HELD), 1))
-    for number, took in enumerate((0.67, 1.17, 0.36, 1.08, 0.62, 0.9, 1.23), start=1):
-        share = applied(t, number * DWELL / 1000.0, took, 1e-3)
-        acting += share[:, None] * (LEVELS[number] - LEVELS[number - 1])
-    dynamics = {'dynamics__bending_damping_ratio': 0.028, 'dynamics__torsion_damping_ratio': 4e-4}
-    found = searched(read(acting, **dynamics), HELD)
-    assert [f.name for f in found.setup] == ['load_ramp'] * 7
-    assert [e.active.effect.name for e in found.effects] == ['damping']
-    assert found.effects[0].active.values['torsion_ratio'] == pytest.approx(4e-4, abs=2e-5)
-    assert (found.verdict, found.unknown) == ('effects_found', ())
-    assert found.floors < 1.1
-
-
 def test_what_rings_on_is_free_after_excluded_samples() -> None:
     volts = np.zeros((2000, 6))
     volts[500:900] = np.nan
@@ -278,12 +179,3 @@ def test_load_time_is_unseen_in_excluded_samples() -> None:
     assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
     assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
     assert not unseen(ws, ZeroDirection(0, 0, 1e-6))
-
-
-@pytest.mark.slow
-def test_two_effects_are_no_rounded_loads() -> None:
-    """One of them moves the plate as a load does. Whether loads were rounded is asked first, at no search's expense."""
-    two = {**ROTATED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}
-    found = searched(read(HELD, **two), HELD)
-    assert {e.active.effect.name for e in found.effects} == {'sensor_rotation', 'load_direction'}
-    assert (found.verdict, found.setup) == ('effects_found', ())

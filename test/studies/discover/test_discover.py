@@ -83,32 +83,6 @@ def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
     assert rotated.simulations < 2000
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    'hidden',
-    [
-        # Beside a heavy tip all signatures are others than beside the rig as it is described.
-        {'tip_mass': {'mass': 0.036}, 'amplifier_lag': {'time_constant': 2e-5}},
-        # Of three axes of the clamp the right one shows beside the others only.
-        {
-            'mount_tilt': {'x': 7.7e-6, 'y': -1.4e-5},
-            'clamp_friction': {'axis': 1, 'width': 7.37e-6},
-            'thermal_drift': {'psd': 1, 'x': 7.6e-7, 'y': -1.3e-6},
-            'channel_skew': {'psd': 2, 'delay': 4.57e-5},
-        },
-    ],
-)
-def test_what_shows_beside_the_others_only_is_found(hidden: dict[str, dict[str, float]]) -> None:
-    values = {f'effects.{name}.{k}': v for name, e in hidden.items() for k, v in {'name': name, **e}.items()}
-    found = discover([observe(replace_values(RIG, values))], RIG, bank=BANK)
-    assert found.verdict == 'effects_found'
-    assert {e.active.effect.name for e in found.effects} == set(hidden)
-    for e in found.effects:
-        for p in e.active.effect.parameters:
-            if p.kind == 'choice':
-                assert e.active.values[p.name] == hidden[e.active.effect.name][p.name]
-
-
 def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
     assert {c.channel for c in rotated.where.cells[:5]} <= {'x2', 'y2'}
     assert rotated.where.cells[0].p < 1e-6
@@ -136,21 +110,6 @@ def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
     tree = rotated.tree()
     check_schema(tree)
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
-
-
-@pytest.mark.slow
-def test_sizes_agreeing_beyond_chance_share_a_cause() -> None:
-    lag = observe(with_effect('amplifier_lag', time_constant=3e-5))
-    near = {*NEAR} - {'amplifier_lag'}
-    found = discover([lag], RIG, without=[n for n in effect_names() if n not in near], bank=BANK)
-    assert [e.active.effect.name for e in found.effects] == ['channel_skew', 'channel_skew']
-    assert found.verdict == 'unknown_effect'
-    assert not found.unknown[0].unexplained
-    assert 'agree in size (delay 3' in found.unknown[0].signature
-    assert found.unknown[0].explains > 0.9
-    assert 'their sizes are tied' in found.sentence
-    # With the cause in the library it is named alone.
-    assert [e.active.effect.name for e in discover([lag], RIG, bank=BANK).effects] == ['amplifier_lag']
 
 
 @pytest.mark.slow

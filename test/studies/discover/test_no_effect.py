@@ -184,23 +184,11 @@ def test_workspace_reports_slow_noise_of_recording() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('corner', [0.3, 1.0, 5.0, 30.0])
+@pytest.mark.parametrize('corner', [0.3, 5.0])
 def test_nothing_is_missing_from_slow_noise(corner: float) -> None:
     found = discover([observed(corner, 1)])
     assert found.verdict == 'nothing_missing'
     assert not found.setup
-
-
-@pytest.mark.slow
-def test_an_effect_beside_slow_noise_is_named_and_its_sd_covers() -> None:
-    off = []
-    for seed in range(6):
-        found = discover([observed(5.0, seed, angle=0.002)])
-        assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
-        assert found.verdict == 'effects_found'
-        off.append((found.effects[0].active.values['angle'] - 0.002) / found.effects[0].sd['angle'])
-    assert np.sqrt(np.mean(np.square(off))) < 1.8
-    assert np.sqrt(np.mean(np.square(off))) > 0.3
 
 
 BAG = Path(__file__).parents[3] / 'bags' / 'clean'
@@ -237,14 +225,6 @@ def test_residual_of_noisy_zero_is_nothing_unknown(faultless: Discovery) -> None
 def test_the_same_constants_are_reported_if_no_zero_was_taken() -> None:
     found = discover([recorded(taken=False)])
     assert found.effects or found.unknown
-
-
-@pytest.mark.slow
-def test_an_effect_beside_such_a_zero_is_named_alone() -> None:
-    found = discover([recorded(taken=True, rotated=0.004)])
-    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
-    assert found.effects[0].active.values['angle'] == pytest.approx(0.004, abs=4.0 * found.effects[0].sd['angle'])
-    assert found.verdict == 'effects_found'
 
 
 def test_a_constant_is_whitened_by_what_the_zero_allows() -> None:

@@ -148,16 +148,6 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
 
 
 @pytest.mark.slow
-def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
-    o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
-    found = found_in(changed(o, rotated(1)))
-    assert [f.name for f in found.setup] == ['channel_sign']
-    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
-    assert found.verdict == 'effects_found'
-    assert found.gap_before > 100 * found.gap_after
-
-
-@pytest.mark.slow
 def test_zero_of_second_recording_is_named_with_it() -> None:
     second = dataclasses.replace(recorded(seed=2), name='second')
     shift = np.array([0.3, -0.2, 0.0, 0.1, 0.4, 0.0])

@@ -86,7 +86,7 @@ def test_smooth_remainder_is_function_of_its_variable() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('seed', range(2))
 def test_noise_alone_is_no_function(seed: int) -> None:
     assert smooth(Table(seed, 0.0)) is None
 
@@ -137,14 +137,6 @@ def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     shapes = np.log([[noise, size, length]])
     again = unseen_residual(idle, ('x',), shapes, np.ones(n, dtype=bool), shaped=True)
     np.testing.assert_allclose(again, residual, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_gap_with_given_shapes_is_reported_beside_the_other() -> None:
-    """It is smaller, for the shapes have seen the readings, and not below the noise."""
-    found = smooth(Table(1, 1.0))
-    assert found is not None
-    assert 0.8 * NOISE < found.heldout_as_shaped < found.heldout
 
 
 def test_few_readings_report_no_function() -> None:
@@ -260,14 +252,6 @@ def test_what_small_terms_do_together_is_reported_everywhere() -> None:
     assert message['unseen'] < message['unseen_named']
     assert f'{len(message["terms"])} small terms together lower the unseen error' in found.sentence
     assert 'small terms together' in found.files()['report.html']
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('seed', range(2))
-def test_nothing_is_reported_to_remain_where_nothing_does(seed: int) -> None:
-    found = psd_deflection.discover_in(Small(np.zeros(TERMS), 40, seed))
-    tree = json.loads(found.json())
-    assert (found.verdict, tree['remains'], tree['predictive']) == ('nothing_missing', False, None)
 
 
 class Zeros(Plant):

@@ -35,42 +35,6 @@ def test_intervals_hold_the_truth(name: str, frequency_off: float, damping_off: 
     assert damping >= 9
 
 
-@pytest.mark.slow
-def test_one_weight_hung_on_and_off_rings_as_well() -> None:
-    """The windows that hold a blow swing most; there are more of them than would be tried."""
-    samples = rung(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(4), 14.0, 6, equal=True)
-    found = modes_of(samples, RATE)
-    assert found.how == 'ring-down'
-    (mode,) = found.modes
-    assert abs(mode.frequency - 14.0) < 4.0 * mode.frequency_sd < 0.0005 * 14.0
-    assert abs(mode.damping - 0.02) < 4.0 * mode.damping_sd < 0.03 * 0.02
-
-
-@pytest.mark.slow
-def test_two_modes_that_beat_are_two() -> None:
-    """Bending planes turned against the axes: both show on each."""
-    second, damping = 14.3, 0.01
-    link = Link(((14.0, damping, 0.5), (second, damping, 0.5)))
-    found = modes_of(rung(link, np.random.default_rng(6), 14.0, 3), RATE)
-    assert found.how == 'ring-down'
-    low, high = sorted(found.modes, key=lambda m: m.frequency)
-    for mode, frequency in ((low, 14.0), (high, second)):
-        assert abs(mode.frequency - frequency) < 4.0 * mode.frequency_sd < 0.0005 * frequency
-        assert abs(mode.damping - damping) < 4.0 * mode.damping_sd < 0.03 * damping
-
-
-@pytest.mark.slow
-def test_coloured_noise_widens_interval_without_bias() -> None:
-    link = Link(((14.0, 0.02, 1.0),), noise=20e-6, memory=0.9)
-    modes = [modes_of(rung(link, np.random.default_rng(seed)), RATE) for seed in range(2)]
-    assert {m.how for m in modes} == {'ring-down'}
-    for found in modes:
-        (mode,) = found.modes
-        assert abs(mode.damping - 0.02) < 4.0 * mode.damping_sd
-        assert abs(mode.frequency - 14.0) < 4.0 * mode.frequency_sd
-        assert found.noise == pytest.approx(20e-6, rel=0.15)
-
-
 def test_noise_that_remembers_has_no_mode() -> None:
     for seed in range(2):
         samples = 2e-6 * noise(10_000, 0.9, np.random.default_rng(seed))
@@ -105,12 +69,6 @@ def test_a_second_mode_is_found_and_separated() -> None:
     assert second.frequency == pytest.approx(46.0, rel=1e-3)
     assert second.damping == pytest.approx(0.01, rel=0.05)
     assert first.amplitude > 5.0 * second.amplitude
-
-
-@pytest.mark.slow
-def test_one_mode_is_not_made_two() -> None:
-    for seed in range(2):
-        assert len(modes_of(rung(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(seed)), RATE).modes) == 1
 
 
 def test_lost_samples_and_creep_do_not_move_it() -> None:

@@ -115,16 +115,6 @@ def test_other_natural_frequencies_change_no_time() -> None:
 
 
 @pytest.mark.slow
-def test_rig_with_jittered_load_times_lacks_nothing() -> None:
-    observed = Observation('hung', RIG, QUIET, annotated(JITTER), None)
-    found = discover([observed], RIG)
-    assert found.verdict == 'nothing_missing'
-    assert found.floors < 1.1
-    assert {(f.name, f.where) for f in found.setup} == {('load_time', f'load {i}') for i in range(1, 7)}
-    assert [f.value for f in found.setup] == pytest.approx(JITTER, abs=2e-3)
-
-
-@pytest.mark.slow
 def test_wiring_signs_and_units_change_no_time() -> None:
     other = QUIET[:, [1, 0, 2, 4, 3, 5]] * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
     found = corrected(other, annotated(LATE) * np.array([-0.102, 0.102, 0.102]))
@@ -214,17 +204,6 @@ def test_load_between_samples_moves_link_at_its_time(moments: float) -> None:
     away = np.abs(np.arange(1000) - first) > 4
     # The mean of that sample alone is off by 1e-3.
     assert np.abs(moved - exact)[away].max() < 5e-5
-
-
-@pytest.mark.slow
-def test_late_note_and_channels_read_after_one_another() -> None:
-    read = volts(applied(), effects__e__name='channel_skew', effects__e__psd=2, effects__e__delay=2e-4)
-    found = discover([Observation('x', RIG, read, annotated((0.0, 0.0, 3.4, 0.0, 0.0, 0.0)))])
-    assert [e.active.label for e in found.effects] == ['channel_skew (psd 2)']
-    assert found.effects[0].active.values['delay'] == pytest.approx(2e-4, abs=2e-6)
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.05
-    assert [(f.name, f.where) for f in found.setup] == [('load_time', 'load 3')]
 
 
 def test_load_from_second_sample_is_shifted_completely() -> None:

@@ -14,8 +14,6 @@ from scipy.optimize import brentq
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads import sway
 from psd_deflection.studies.loads.annotated_times import correct_loads
 from psd_deflection.studies.loads.effective import effective_loads
@@ -175,15 +173,6 @@ def test_unannotated_loads_are_named_alike_everywhere() -> None:
     assert reported.value == pytest.approx(16 / 24)
     assert found.verdict == 'nothing_missing'
     assert found.simulations <= 300
-
-
-@pytest.mark.slow
-def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
-    found = discover([Observation('x', RIG, read(SHORT_HELD, **ROTATED), STOPPED)])
-    assert [f.name for f in found.setup] == ['load_coverage']
-    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
-    assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=4.0 * found.effects[0].sd['angle'])
-    assert found.verdict == 'effects_found'
 
 
 def test_missing_loads_are_excluded_until_next_note() -> None:

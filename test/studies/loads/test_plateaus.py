@@ -86,25 +86,6 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     assert wrong_notes(RIG, QUIET[: 4 * DWELL], NEVER[: 4 * DWELL]) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('number', 'load'),
-    [
-        pytest.param(5, (40, -80, 20), id='one axis'),
-        pytest.param(5, (-40, -40, 20), id='a sign'),
-        pytest.param(7, (0, -50, 0), id='the last'),
-        pytest.param(1, (0, -200, 0), id='ten times as much, beyond the detectors'),
-        pytest.param(3, (0, -50, -290), id='a torque ten times as large'),
-        pytest.param(2, (0, -5.1, 0), id='kilograms'),
-    ],
-)
-def test_a_note_that_is_far_off_is_wrong_however_far(number: int, load: tuple[float, float, float]) -> None:
-    (note,) = wrong_notes(RIG, QUIET, annotated_as(number, load))
-    assert note.where == f'load {number}'
-    assert note.applied == pytest.approx(LEVELS[number], abs=0.1)
-    assert note.size == pytest.approx(np.abs(LEVELS[number] - load).max(), abs=0.1)
-
-
 LONG = np.concatenate((LEVELS[:-1], LEVELS[1:]))
 """Each load twice."""
 LONG_QUIET = read(np.repeat(LONG, DWELL, axis=0))
