@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.measure.watch import Watch, _Channel, _Window
+from psd_deflection.measure.watch import Watch
 from psd_deflection.model.solvers.registry import solver_from_rig
 from psd_deflection.records import (
     AppliedLoad,
@@ -48,8 +49,11 @@ class Fed:
 
     def run(
         self, seconds: float, of: Callable[[FloatArray], FloatArray] | FloatArray, status: BlockStatus = BlockStatus.OK
-    ) -> None:
-        """Blocks with the readings ``of`` (4,) m, or a function of the time in this run (n,) that gives (n, 4)."""
+    ) -> FloatArray:
+        """Blocks with the readings ``of`` (4,) m, or a function of the time in this run (n,) that gives (n, 4).
+
+        Their readings with the noise (n, 4), m.
+        """
         t, many = np.arange(round(seconds * SECOND)) / SECOND, self._readings
         dots = of(t) if callable(of) else np.tile(of, (len(t), 1))
         dots = dots + self._noise * self._rng.standard_normal((len(t), many))
@@ -67,6 +71,7 @@ class Fed:
             ):
                 self.watch.put(record)
             self.block += 1
+        return dots
 
 
 def under(fx: float, fy: float) -> FloatArray:
@@ -311,11 +316,98 @@ def test_drift_ringing_and_gaps_are_no_alarm() -> None:
     assert fed.watch.spoilt > 0
 
 
-def learnt(*means: float) -> _Channel:
-    """A channel that has learned its level from windows of scatters 0 to 11 µm."""
-    channel = _Channel('x1')
-    for scatter in range(12):
-        channel.still(_Window(0.0, 1e-6 * scatter))
-    for mean in means:
-        channel.learn(mean)
-    return channel
+class Expected(NamedTuple):
+    """A second reckoning of one channel: the alarm, and how many windows after it ended."""
+
+    since: int
+    observed: int
+    shift: float
+    sd: float
+    ended: int
+
+
+def page(values: FloatArray, least: float) -> Expected:
+    """Page's two sums of the means of 25 blocks, from the eighth window on; four tell the level before.
+
+    A window that scatters more than three times as much as a quarter of all do is passed over.
+    """
+    windows = values.reshape(-1, 25)
+    means, scatters = windows.mean(axis=1), windows.std(axis=1)
+    level, sums, began = float(np.median(means[3:7])), np.zeros(2), [0, 0]
+    since, first, quiet, out, counted = 0, 0, 0, None, list[float]()
+    for k in range(7, len(means)):
+        usual = np.sort(scatters[max(0, k - 59) : k + 1])
+        if scatters[k] > 3.0 * usual[len(usual) // 4]:
+            continue
+        counted.append(means[k])
+        steps = np.abs(np.diff(counted))
+        wander = 1.4826 * np.median(steps) / 2**0.5 if len(steps) >= 4 else 0.0
+        sd = max(usual[len(usual) // 4] / 5.0, wander)
+        off = (means[k] - level) / sd
+        before, sums = sums, np.maximum(sums + np.clip(np.array([off, -off]) - max(2.0, least / sd), -8.0, 8.0), 0.0)
+        began = [k if b == 0.0 < s else at for b, s, at in zip(before, sums, began, strict=True)]
+        sums, since = np.minimum(sums, 30.0), since + 1 if sums.any() else 0
+        if not since:
+            level += (means[k] - level) / 120.0
+        if out is None:
+            first = (first or k) if sums.max() > 10.0 else 0
+            if first and k >= first + 6:
+                shift = float(np.median(means[k + 1 - min(since, 4) : k + 1])) - level
+                out = began[int(sums.argmax())], k, shift, sd * (1.0 / min(since, 4) + 0.25) ** 0.5
+        else:
+            quiet = 0 if sums.max() > 10.0 else quiet + 1
+            if quiet == 20:
+                return Expected(*out, k)
+    raise AssertionError('no alarm that ends')
+
+
+def test_an_alarm_is_that_of_a_second_reckoning() -> None:
+    """psd_1 is moved across the base line, so that this stays as long, as soon as its level is known; then back."""
+    fed, dots = Fed(), []
+    fed.load(0.0, 0.0)
+    moved = 4e-6 * np.array([0.07, -0.1, 0.0, 0.0]) / np.hypot(0.07, 0.1)
+
+    def window(number: int) -> None:
+        """All shake alike, now more, now less, so that what is usual is no wander from window to window."""
+        size = 8.2e-6 if number == 20 else (2.0 + 0.5 * (3 * number % 7)) * 1e-6
+        still = REST + moved * (7 <= number < 19)
+        dots.append(fed.run(0.5, lambda t: still + size * np.sin(12.0 * np.pi * t)[:, None]))
+
+    for number in range(19):
+        window(number)
+    alarm, ended = fed.watch.alarm, 18
+    while alarmed(fed):
+        ended += 1
+        window(ended)
+    x1, y1 = (page(np.concatenate(dots)[:, i], RIG.acquisition.watch_wander) for i in (0, 1))
+    assert alarm is not None
+    assert (alarm.channel, alarm.also) == ('y1', ('x1',))
+    assert (alarm.shift, alarm.sd) == pytest.approx((y1.shift, y1.sd), rel=1e-9)
+    assert alarm.since_ns + 20_000_000 == 500_000_000 * y1.since
+    assert alarm.observed_ns + 20_000_000 == 500_000_000 * (y1.observed + 1)
+    assert x1.since == y1.since
+    assert ended == max(x1.ended, y1.ended)
+    # Which scatter is usual is known after four windows.
+    assert (fed.watch.windows, fed.watch.spoilt) == (ended + 1, 3 + 1)
+
+
+@pytest.mark.parametrize('lost', [False, True])
+@pytest.mark.parametrize('load', [(0.0, -40.0, 0.0), (0.0, 0.0, 10.0)])
+def test_after_zero_or_lost_block_first_window_counts(load: tuple[float, float, float], lost: bool) -> None:
+    """The level before the load is that of one window, and nothing of before the zero or the gap is in it."""
+    fed = Fed(noise=0.0)
+    fed.run(2.0, REST)
+    fed.load(0.0, 0.0)
+    fed.run(0.1, under(3.0, 5.0) + X1)
+    if lost:
+        fed.run(0.02, REST, BlockStatus.LASER_LOST)
+    else:
+        fed.watch.changed(ParameterChange(0, 0, (('psd_1.zero', (0.0, 0.0)),)), RIG)
+    fed.run(3.6, REST)
+    fed.load(*load)
+    fed.run(3.0, under(0.0, 1.06 * load[1]) if load[1] else twisted(1.06 * load[2]))
+    alarm, moved = fed.watch.alarm, 1.06 * load[1] * COMPLIANCE[1] + 1.06 * load[2] * COMPLIANCE[2]
+    assert alarm is not None
+    assert alarm.channel == ('dy' if load[1] else 'theta')
+    assert alarm.shift == pytest.approx(moved * 0.06 / 1.06, rel=1e-6)
+    assert alarm.sd == pytest.approx(((5e-6 if load[1] else 40e-6) + 0.02 * abs(moved)) / 6.0, rel=1e-6)
