@@ -84,7 +84,6 @@ def test_a_replay_gives_what_was_published() -> None:
     assert estimates.covariance is not None
     assert np.array_equal(estimates.t_ns, published.t_ns)
     assert np.array_equal(estimates.pose[:, :2], published.pose[:, :2])
-    # The message has a quaternion.
     assert np.allclose(estimates.theta, published.pose[:, 2], rtol=0.0, atol=1e-17)
     assert np.array_equal(estimates.covariance, published.covariance)
     assert estimates.wrench is not None
@@ -136,7 +135,6 @@ def test_a_simulated_recording_is_a_recording() -> None:
     # The flat plate of the simulation is what the method assumes; the rest is the step inside a block.
     settled = np.abs(estimates.t - 1.5) > 0.05
     assert np.abs(estimates.pose - truth)[settled].max() < 1e-5
-    # The noise too is that of the seed.
     one, again, other = (psd_deflection.simulate(rig, 'thesis:0.5', seed=seed).samples['y1'] for seed in (1, 1, 2))
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
@@ -257,7 +255,6 @@ def test_estimates_as_tables_with_units() -> None:
     assert np.array_equal(frame['dy'], estimates.dy)
     assert estimates.wrench is not None
     assert np.array_equal(data['fy'], estimates.wrench[:, 1])
-    # What was recorded as plain poses has no covariance, and no such columns.
     recorded = psd_deflection.open(CLEAN).estimates()['/link_tip/deflection']
     assert recorded.sd is None
     assert 'sd_dx' not in recorded.to_pandas()

@@ -61,7 +61,6 @@ def test_a_golden_recording_gives_its_estimates_and_rejections(name: str) -> Non
 
 
 def test_fresh_recording_replays_to_the_last_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # Replayed here into a bag of its own, which then is of this machine.
     again = tmp_path / 'again'
     assert main(['replay', str(BAGS / 'lost_samples'), '--out', str(again)]) == 0
     assert main(['replay', str(again), '--compare']) == 0

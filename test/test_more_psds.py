@@ -78,9 +78,6 @@ def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
     return np.rint(noisy / STEP).astype(np.int32)
 
 
-# The rig file.
-
-
 @pytest.mark.slow
 def test_third_psd_defaults_are_filled_and_round_trip(three: Rig) -> None:
     assert three.psds[2].center == (0.08, -0.06)
@@ -122,9 +119,6 @@ def test_what_is_made_for_two_is_rejected(three: Rig, changes: dict[str, object]
         Pipeline(replace_values(three, changes))
 
 
-# By truth.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('solver', 'more', 'pose', 'unknowns'),
@@ -152,12 +146,9 @@ def test_errors_are_those_of_the_covariance(
     redundant = np.array([e.chi_square for e in found])
     assert redundant.mean() == pytest.approx(freedom, abs=4.0 * (2.0 * freedom / 300) ** 0.5)
     if unknowns == 5:
-        # The tilts have the sign that was given.
         tilts = np.array([(e.phi, e.omega) for e in found]).mean(axis=0)
         assert tilts == pytest.approx(pose[3:], abs=2e-5)
 
-
-# One PSD fails in the middle of a stream.
 
 FAILS = 1800
 
@@ -241,7 +232,6 @@ def test_without_one_psd_the_estimate_goes_on_from_the_others(
     assert (np.mean([e.variances for e in found[-50:]], axis=0) > 1.1 * before).all()
     squares = np.array([e.chi_square for e in found[-80:]])
     assert np.isnan(squares).all() if solver == 'pose' else 0.5 < squares.mean() < 1.6
-    # The dots of the others are published, and no others.
     topics = {m.topic for m in to_messages(after[-1])}
     assert topics == {f'/psd_{n}/spot' for n in (1, 2, 3) if n != psd + 1}
 
@@ -262,7 +252,6 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     assert not any(s.excluded for s in spots if s.index * 20 < FAILS)
     assert pipeline.estimator.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
     assert f'psd_{psd + 1} contradicts the others and is left out' in pipeline.counters.findings
-    # What is left agrees.
     good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.excluded]
     assert np.mean(good) < 2.0
 
@@ -365,9 +354,6 @@ def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solv
     off = np.abs([e.pose for e in found]) / np.sqrt([e.variances for e in found])
     assert off.max() < 7.0
     assert (off < 1.96).mean(axis=0).min() > 0.93
-
-
-# Bit for bit again.
 
 
 @pytest.mark.slow

@@ -127,7 +127,6 @@ def test_sums_of_products_are_those_of_numpy(spec: tuple[str, *tuple[tuple[int, 
     operands = [rng.normal(size=shape) for shape in spec[1:]]
     want = np.einsum(spec[0], *operands)
     assert FIXED.einsum(spec[0], *operands) == pytest.approx(want, rel=1e-12, abs=1e-12)
-    # Whatever the memory looks like.
     rotated = [np.asfortranarray(a) for a in operands]
     np.testing.assert_array_equal(FIXED.einsum(spec[0], *rotated), FIXED.einsum(spec[0], *operands))
 
@@ -150,7 +149,6 @@ def test_rows_are_added_in_pairs(count: int, shape: tuple[int, ...]) -> None:
     wanted = added(list(rows))
     first = in_pairs(rows)
     np.testing.assert_array_equal(first, wanted)
-    # Another sum of that shape leaves the first alone; the rows need not lie one after the other.
     np.testing.assert_array_equal(in_pairs(-np.asfortranarray(rows)), -wanted)
     np.testing.assert_array_equal(first, wanted)
     for axis in range(rows.ndim):

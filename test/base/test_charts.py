@@ -137,7 +137,6 @@ def test_every_curve_is_in_its_panel() -> None:
     legend = first.get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == ['a', 'b']
-    # The axis of time is named once.
     assert (first.get_xlabel(), second.get_xlabel(), second.get_ylabel()) == ('', 't / s', 'y / µm')
     assert second.get_legend() is None
     assert np.asarray(second.lines[1].get_xdata()).tolist() == [3.0, 3.0]

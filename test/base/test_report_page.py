@@ -92,7 +92,6 @@ def test_every_plot_says_its_values_under_one_cursor(page: Page) -> None:
     assert float(message['c0p0 after']) == -at
     assert float(message['c0p1 before']) == at**2
     assert float(message['c0p1 after']) == at
-    # Another axis has a cursor of its own.
     assert message['c1p0 missing'] == ''
 
 

@@ -32,7 +32,6 @@ def covers(part: Inside) -> bool:
 
 def test_temperature_drift_in_rig_file_is_covered() -> None:
     assert covers(warming(rest_s=26, steps=2, seed=3).rest)
-    # The judge can say no.
     assert warming(reported=False, rest_s=26, steps=2, seed=3).rest.joint < 0.8
 
 

@@ -52,12 +52,10 @@ def test_cubic_spring_of_synthetic_silverbox_is_found(tmp_path: Path) -> None:
     y = oscillator(tmp_path)
     plant = Silverbox(tmp_path, train=(0, COUNT), shape=(4, 6))
     np.testing.assert_allclose(plant.y, y, atol=1e-9)
-    # The pieces of a case follow each other without a gap.
     np.testing.assert_array_equal(np.concatenate(plant.measured(), axis=1)[0], plant.y[50:2450])
     plant.library = tuple(e for e in plant.library if e.name in ('cubic_spring', 'quadratic_drag', 'force_offset'))
     found = discover_in(plant)
     (spring,) = found.effects
     assert spring.active.effect.name == 'cubic_spring'
     assert spring.active.values['stiffening'] == pytest.approx(CUBIC, rel=0.05)
-    # The noise that was added, and little more, is left.
     assert 0.9e-4 < found.gap_after < 2e-4

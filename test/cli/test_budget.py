@@ -28,14 +28,12 @@ def test_the_page_has_a_bar_for_every_cause_and_the_same_numbers(tmp_path: Path)
     page = (tmp_path / 'report.html').read_text()
     bars = dict(re.findall(r'<th scope="row">([^<]+(?:<wbr>[^<]+)*)</th>(.*?)</tr>', page))
     drawn = {name.replace('<wbr>', '').partition(' ')[0]: row for name, row in bars.items()}
-    # What is mere rounding has none.
     assert drawn.keys() == {'total', *(t['name'] for t in terms if max(t['rms']) > 1e-12)}
     for term in terms:
         if term['name'] in drawn:
             shown = [float(v) for v in re.findall(r'</i>([^<]+)<', drawn[term['name']])]
             wanted = np.array(term['rms']) * (1e6, 1e6, math.degrees(1e3))
             assert shown == pytest.approx(wanted, rel=6e-3)
-    # No script is needed for them.
     assert '<script' not in page
 
 

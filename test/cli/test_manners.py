@@ -317,7 +317,6 @@ def test_a_closed_standard_error_keeps_the_exit_status(where: str, folder: Path)
     done = program(f'PROGRAM replay {CLEAN} --json {where}')
     assert done.returncode == 0
     assert strict(done.stdout)['samples'] == 4000
-    # It warns of the cut.
     done = program('PROGRAM replay cut.mcap --json 2>&-')
     assert done.returncode == 0
     assert strict(done.stdout)['samples'] > 1000

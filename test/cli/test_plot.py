@@ -41,7 +41,6 @@ def test_the_page_is_whole(tmp_path: Path) -> None:
     assert not re.search(r'(src|href)="(?!#)|\bimport\b[^(;]*from|@import|url\(', page)
     assert 'laser lost' in page
     assert '52 blocks' in page
-    # As many plots as have data, each with its keys.
     assert re.findall(r'<div id="plot_(\w+)">', page) == ['shift', 'theta', 'sums', 'spectrum']
     recorded = open_recording(BAGS / 'laser_off').estimates()['/link_tip/deflection']
     columns = content_of(out)['columns']
@@ -79,7 +78,6 @@ def test_loads_and_references_are_drawn(loaded: Path, tmp_path: Path) -> None:
         [1.99, 'load', 0.0, -10.0, -5.85],
         [2.99, 'load', 10.0, 0.0, 0.0],
     ]
-    # The last one holds until the end.
     assert column(content['loads']['fy']).tolist() == [0.0, -10.0, 0.0, 0.0]
     assert column(content['loads']['t'], '<f8')[-1] == pytest.approx(3.98, abs=0.01)
     references = column(content['references']['dy'])
@@ -96,9 +94,7 @@ def test_a_window_is_drawn(loaded: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert (found['blocks'], found['samples'], found['duration_s']) == (50, 1000, pytest.approx(1.0, abs=1e-6))
     content = content_of(out)
     t = column(content['columns']['t'], '<f8')
-    # Times count from the start of the recording, not from that of the window.
     assert (t[0], t[-1]) == (pytest.approx(2.5, abs=1e-6), pytest.approx(3.48, abs=1e-6))
-    # The load that holds when the window begins is known there.
     assert [[round(m[0], 2), *m[2:]] for m in content['marks']] == [[2.5, 0.0, -10.0, -5.85], [2.99, 10.0, 0.0, 0.0]]
     assert main([*arguments, '--out', str(tmp_path / 'window.png')]) == 0
 

@@ -72,7 +72,6 @@ def test_no_reply_is_made_up_and_the_one_that_follows_is_found(pieces: list[byte
     received = b''.join(pieces)
     reply = find_reply(received, 'info 1')
     if reply is not None:
-        # Without the padding it stands there, echo, reply and carriage return.
         assert re.search(rb'info 1( [^\r]*)?\s*\r', received.replace(b'\x00', b''))
     assert find_reply(received + b'\rinfo 1 2108\r', 'info 1') == '2108'
 
@@ -234,7 +233,6 @@ def test_an_unplugged_device_is_configured_again(wired: Any, run: Any, unloaded:
     running.heard('waiting for it to come back')
     port.plug(SimulatedDataq(unloaded(load_rig())))
     running.heard('the device is back')
-    # What had come before it went is handed over by now.
     running.forget()
     running.take(40)
     assert running.acquisition.counters.disconnects == 1
@@ -248,7 +246,6 @@ def test_a_silent_device_is_configured_again(wired: Any, run: Any, unloaded: Any
     device._obey('stop', 0)
     running.heard('no scans come; waiting for it to come back')
     running.heard('the device is back')
-    # What had come before it went is handed over by now.
     running.forget()
     running.take(40)
 

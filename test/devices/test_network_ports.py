@@ -210,9 +210,6 @@ def test_over_ipv6() -> None:
         port.close()
 
 
-# Datagrams.
-
-
 class Datagrammed:
     """A port for datagrams, and its name."""
 
@@ -364,9 +361,6 @@ def test_two_that_want_the_same_datagrams(udp: Datagrammed) -> None:
 def test_an_address_of_another_machine() -> None:
     with pytest.raises(DeviceError, match=r'192\.0\.2\.1 is no address of this machine'):
         open_port('udp://192.0.2.1:4000', BAUD)
-
-
-# A serial port of another machine; pyserial's own server side is the judge.
 
 
 class Terminal(serial.Serial):

@@ -207,7 +207,6 @@ def test_an_unplugged_one_comes_back(wired: Any, run: Any, unloaded: Any) -> Non
     running.heard('waiting for it to come back')
     port.plug(SimulatedLines(unloaded(load_rig())))
     running.heard('the device is back')
-    # What had come before it went is handed over by now.
     running.forget()
     running.take(40)
     assert running.acquisition.counters.disconnects == 1

@@ -221,7 +221,6 @@ def test_a_rig_in_a_page_can_be_pasted(page: Path, text: str, tmp_path: Path) ->
 def test_every_case_is_on_the_page_with_its_picture() -> None:
     message = gallery.kept()
     assert list(message) == [case.name for study in STUDIES for case in CASES if case.study == study]
-    # Nothing on the page was written by hand.
     assert gallery.PAGE.read_text() == gallery.page(message)
     assert {path.stem for path in gallery.FIGURES.glob('*.png')} == set(message)
 

@@ -63,7 +63,6 @@ def test_repeats_are_passed_over_and_counted() -> None:
     cutter = BlockCutter(20)
     cutter.add(*chunk_of([0, 1, 1, 2]))
     cutter.add(*chunk_of([2, 3]))
-    # Nothing but repeats: of one sample, and of several.
     assert cutter.add(*chunk_of([3])) == []
     assert cutter.add(*chunk_of([0, 1, 2])) == []
     assert cutter.add(*chunk_of([])) == []

@@ -167,7 +167,6 @@ def test_inconsistent_reading_widens_covariance() -> None:
     volts[:, 0] = 1e-3 / 5e-4
     (widened,), (reported,) = (estimates(volts, {'consistency': c}) for c in ('widen', 'report'))
     assert widened.pose == reported.pose
-    # The truth is rest.
     assert max(np.abs(widened.pose) / np.sqrt(np.array(widened.covariance)[[0, 4, 8]])) < 2.0
     assert max(np.abs(reported.pose) / np.sqrt(np.array(reported.covariance)[[0, 4, 8]])) > 100.0
 

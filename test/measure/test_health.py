@@ -42,9 +42,6 @@ def moving(n: int, pose: tuple[float, float, float] = POSE, seed: int = 3) -> Co
     return still(pose, n * SIZE, seed)
 
 
-# ---- one detector alone
-
-
 @pytest.mark.parametrize('psd', [1, 2])
 def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> None:
     rig = load_rig()
@@ -83,7 +80,6 @@ def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
         covariance = np.reshape(e.covariance, (3, 3))
         assert (np.abs(error) < 4 * np.sqrt(np.diag(covariance))).all()
         assert np.linalg.eigvalsh(covariance).min() > 0
-        # And it is worse than with both, for the axis that the arm turns.
         assert e.covariance[8] > full.covariance[8]
     assert found[30].solver == 'exact'
     # What a block shows of motion differs from block to block, and with it the covariance, by a few per cent.
@@ -92,10 +88,8 @@ def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
     assert pipeline.counters.rejected == {}
     statuses = [s.status for s in spots(records)]
     assert statuses[10:30] == [BlockStatus.LASER_LOST] * 20
-    # The torque is not measured: no load is told.
     loads = {r.t_ns for r in records if isinstance(r, TipLoad)}
     assert not loads & {found[b].t_ns for b in range(10, 30)}
-    # A zero is not taken from one detector.
     pipeline = Pipeline(rig)
     records_of(pipeline, dark(moving(10), psd, slice(5, 10)))
     assert pipeline.zero() is None
@@ -106,12 +100,6 @@ def test_saturation_is_reported_with_range_parameter() -> None:
     counts[3, 2] = 32767
     (spot, *_) = [r for r in records_of(Pipeline(load_rig()), counts) if isinstance(r, SpotMeans)]
     assert spot.reason == 'sum1 saturated: 10.000 V, converter.full_scale is 10 V'
-
-
-# ---- memory and replay
-
-
-# ---- findings
 
 
 def test_frozen_detector_is_reported_or_rejected() -> None:
@@ -218,9 +206,6 @@ def test_degraded_rule_change_applies_from_next_block() -> None:
     assert sorted(first) == [0, 1, 2, 3, 4]
     assert sorted(second) == list(range(10, 20))
     assert change.values == (('degraded', 'zero'),)
-
-
-# ---- the calibrated range
 
 
 def test_outside_the_calibrated_range_the_block_says_so() -> None:

@@ -91,13 +91,10 @@ def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: t
     assert len(got) == 2000
     rms = np.sqrt(((got - pose) ** 2).mean(axis=0))
     assert (rms <= 1.1 * BOUND_2UM * SCALE).all(), rms / (BOUND_2UM * SCALE)
-    # And no smaller than chance allows: an error that is hidden would show here.
     assert (rms >= 0.9 * BOUND_2UM * SCALE).all(), rms / (BOUND_2UM * SCALE)
-    # The estimate's own covariance says the same.
     one = next(r for r in records if isinstance(r, DeflectionEstimate) and r.primary)
     stated = np.sqrt(np.array(one.covariance).reshape(3, 3).diagonal())
     np.testing.assert_allclose(stated, BOUND_2UM * SCALE, rtol=0.02)
-    # The load that the link needs for it is the one that was applied.
     wrench = np.array([(r.fx, r.fy, r.tz) for r in records if isinstance(r, TipLoad)]).mean(axis=0)
     np.testing.assert_allclose(wrench, load, atol=5e-3)
 
@@ -129,7 +126,6 @@ def test_untrusted_block_has_no_estimate_but_a_reason(
     assert spots.status is status
     assert message in spots.reason
     assert not any(isinstance(r, DeflectionEstimate | TipLoad) for r in records)
-    # The samples themselves are kept.
     assert any(isinstance(r, SampleBlock) and len(r.seq) == 20 for r in records)
 
 
@@ -150,7 +146,6 @@ def test_zero_takes_present_dots_from_next_block(rig: Rig) -> None:
     after = run(pipeline.process, chunk_of(still(pose, 20 * 30, 6), 600))
     assert abs(estimates(before, 'exact').mean(axis=0) - pose).max() < 1e-6
     assert abs(estimates(after, 'exact').mean(axis=0)).max() < 1e-6
-    # The same change in another pipeline gives the same bits.
     other = Pipeline(rig)
     run(other.process, chunk_of(still(pose, 20 * 30, 5)))
     other.apply(change)
@@ -196,7 +191,6 @@ def test_an_effect_in_the_rig_file_is_simulated_and_corrected(rig: Rig, effect: 
     load = np.tile(sidebar(50.0), (20 * 400, 1))
     counts = RigSimulator(known, 4).step(load).counts
     pose = LinkStatics.from_rig(rig).deflection(*sidebar(50.0))
-    # The last blocks: by then the link is at rest.
     blind, corrected = (
         abs(estimates(run(Pipeline(r).process, chunk_of(counts)), 'exact')[-50:].mean(axis=0) - pose)
         for r in (rig, known)
@@ -225,13 +219,10 @@ def test_drift_in_rig_file_is_corrected_in_replay_too(
     argv = ['simulate', '--params-file', str(model), '--loads', 'constant:0,0,0:4', '--out', str(bag), *words]
     assert main(argv) == 0
     recorded = open_recording(bag).estimates()['/link_tip/deflection'].pose
-    # At rest, and so it is measured, from the first second to the last.
     assert (abs(recorded[-50:].mean(axis=0) - recorded[:50].mean(axis=0)) < [5e-7, 5e-7, 2e-6]).all()
-    # And it is where the link is: a drift counts from the first temperature and the first sample.
     assert (abs(recorded.mean(axis=0)) < [3e-7, 3e-7, 2e-6]).all()
     assert main(['replay', str(bag), '--compare']) == 0
     assert 'no bit differs' in capsys.readouterr().out
-    # Without the effect in the rig file the same samples seem to drift.
     nominal = tmp_path / 'nominal.yaml'
     nominal.write_text('/**:\n  ros__parameters:\n    min_samples: 10\n')
     again = tmp_path / 'again.mcap'
@@ -288,7 +279,6 @@ def test_before_the_first_block_a_change_is_of_block_0_at_time_0(rig: Rig) -> No
     memory = pipeline.memory(drifts)
     assert memory is not None
     assert (memory.t_ns, memory.block) == (0, 0)
-    # After a block it is of the next one.
     records = run(pipeline.process, chunk_of(still(REST, 40, 0)))
     change = pipeline.temperature(22.5)
     assert change is not None
@@ -445,14 +435,12 @@ def test_decimation_keeps_estimates_and_thins_the_rest(size: int, every: int) ->
         published[reported] = Counter(m.topic for record in records for m in to_messages(record))
         primary = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
         poses[reported] = [(*r.pose, *r.covariance) for r in primary]
-        # What runs beside the topics knows of each block.
         assert [r.index for r in records if isinstance(r, SpotMeans)] == list(range(240))
         due = [r.index for r in records if isinstance(r, SpotMeans) and r.published]
         assert due == list(range(0, 240, reported))
         assert {r.block for r in records if isinstance(r, DeflectionEstimate) and not r.primary} == set(due)
     assert published[1] == dict.fromkeys(names, 240)
     assert published[every] == dict.fromkeys(names[:3], 240) | dict.fromkeys(names[3:], 240 // every)
-    # The estimates have the same bits, whatever is beside them.
     assert poses[every] == poses[1]
 
 

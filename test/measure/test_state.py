@@ -58,7 +58,6 @@ def test_every_value_belongs_to_one_part_and_comes_back() -> None:
     other.apply(memory)
     assert other.misfits == []
     again = other.memory(rig)
-    # Of a pipeline that has not seen a block it tells no noise; what it took is the same.
     assert again is not None
     reported = dict(memory.values)
     assert {name: reported[name] for name, _ in again.values} == dict(again.values)
@@ -102,9 +101,6 @@ def test_a_replay_says_what_it_cannot_go_on_from(tmp_path: Path) -> None:
     recording = open_recording(tmp_path / 'bag')
     assert list(replayed(recording, Pipeline(rig_at_start(recording))))
     assert any('state.motion: no part of this rig' in warning for warning in recording.warnings)
-
-
-# Streams of 7 s: at rest, 50 N from 3.007 s on.
 
 
 def pushed() -> FloatArray:

@@ -119,7 +119,6 @@ def test_beams_that_wander_are_an_alarm_unless_the_rig_says_so() -> None:
         alarms.append(fed.watch.alarms)
     assert alarms[0] > 0
     assert alarms[1] == 0
-    # What is larger is seen all the same.
     fed.run(10.0, REST + 3.0 * X1)
     assert alarmed(fed)
 

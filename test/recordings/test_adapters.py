@@ -163,7 +163,6 @@ def test_a_prefix_is_before_every_frame_once() -> None:
         assert len(plain) == len(prefixed) > 0
         for one, other in zip(plain, prefixed, strict=True):
             frame = one.fields['header']['frame_id']
-            # Diagnostics have none.
             assert other.fields['header']['frame_id'] == (f'left_{frame}' if frame else '')
             assert other.fields | {'header': None} == one.fields | {'header': None}
 
@@ -409,7 +408,6 @@ def test_a_pose_lies_in_the_plane_with_all_its_angles() -> None:
         assert angles(fields['orientation']) == pytest.approx((e.theta, e.phi, e.omega), abs=1e-15)
     (reference,) = to_messages(ReferencePose(T0, 1e-3, -2e-3, 0.01))
     assert reference.fields['pose']['position'] == {'x': 1e-3, 'y': -2e-3, 'z': 0.0}
-    # What did not measure tilts says none.
     assert angles(reference.fields['pose']['orientation']) == pytest.approx((0.01, 0.0, 0.0), abs=1e-15)
 
 

@@ -116,9 +116,6 @@ def test_several_files_are_read_in_their_order(tmp_path: Path) -> None:
     assert next(open_recording(folder).blocks()).index == 8
 
 
-# --- sample numbers -----------------------------------------------------------------------------
-
-
 def modulo(path: Path, records: Sequence[SampleBlock]) -> Path:
     """A recording of someone who knows eight fields only."""
     names, formats = ['seq', 'dt', *CHANNELS], {'seq': 'u4', 'dt': 'u4'}
@@ -260,9 +257,6 @@ def test_the_recorded_block_size_counts(tmp_path: Path) -> None:
     assert [len(b.seq) for b in open_recording(path).blocks()] == [10] * 10
 
 
-# --- recordings of other programs ---------------------------------------------------------------
-
-
 def cloud(
     b: SampleBlock, names: Sequence[str], formats: dict[str, str], step: int, big: bool = False
 ) -> dict[str, Any]:
@@ -378,9 +372,6 @@ def test_a_load_without_a_stamp_counts_from_when_it_came(tmp_path: Path) -> None
             (m,) = to_messages(AppliedLoad(t_ns, 1.0, 2.0, 3.0))
             out.write_encoded(m.topic, m.type, cdr.encode(m.type, m.fields), T0 + 99)
     assert [r.t_ns for r in open_recording(tmp_path / 'a.mcap').loads()] == [T0 + 99, T0 + 7]
-
-
-# --- what cannot be read ------------------------------------------------------------------------
 
 
 def information(folder: Path, **changes: object) -> Path:

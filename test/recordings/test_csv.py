@@ -236,9 +236,6 @@ def test_no_text_ends_in_a_traceback(tmp_path: Path, junk: str, where: int) -> N
     assert '\n' not in line.replace(repr(junk)[1:-1], '')
 
 
-# --- estimates ----------------------------------------------------------------------------------
-
-
 def other(e: DeflectionEstimate, solver: str, dx: float) -> DeflectionEstimate:
     return e._replace(solver=solver, dx=dx, primary=False)
 
@@ -249,7 +246,6 @@ def test_estimates_have_one_row_a_block(tmp_path: Path) -> None:
     sink.put(estimate(0))
     sink.put(TipLoad(estimate(0).t_ns, 1.5, -2.5, 0.125))
     sink.put(other(estimate(0), 'wls', 0.25))
-    # Of a block that is not there: it goes into no other row.
     sink.put(TipLoad(estimate(2).t_ns, 9.0, 9.0, 9.0))
     sink.put(estimate(3)._replace(chi_square=1.25))
     sink.put(other(estimate(4), 'wls', 0.5))

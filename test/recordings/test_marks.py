@@ -47,7 +47,6 @@ def test_marks_are_read_and_belong_to_their_part(marked: Path) -> None:
     ('bounds', 'seconds'),
     [
         (('mark:bump', None), (0.5, 1.999)),
-        # The same name at both ends: from the first to the next.
         (('mark:bump', 'mark:bump'), (0.5, 1.499)),
         (('mark:at rest', 'mark:bump'), (1.0, 1.499)),
         ((None, 'mark: at rest '), (0.0, 0.999)),

@@ -62,7 +62,6 @@ def test_samples_keep_number_time_and_volts() -> None:
     for name in ('seq', 't_ns', 'x1', 'sum2', 'flags'):
         np.testing.assert_array_equal(part.samples[name], inside[name])
     assert part.samples['t'][0] == 0.0
-    # The block at the start is cut; its number stays.
     first, *_ = part.blocks()
     assert (first.index, len(first.seq)) == (75, 15)
     assert part.lasts(int(inside['t_ns'][0]), int(inside['t_ns'][-1])) == pytest.approx(0.995)
@@ -92,7 +91,6 @@ def test_parts_put_together_are_the_whole() -> None:
     counted = [part.topics() for part in parts]
     assert counted[1][topic] > 40
     assert all(sum(one.get(name, 0) for one in counted) <= count for name, count in full.topics().items())
-    # A part of a part counts from its own start, and a new block size cuts the same samples.
     inner = parts[1].crop(0.25, 0.5).with_block_size(10)
     assert isinstance(inner, RecordingWindow)
     assert len(inner.samples) == 250

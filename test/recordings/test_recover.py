@@ -80,7 +80,6 @@ def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
     assert {(m.channel.topic, m.log_time, m.cdr) for m in after.messages()} == before
     assert after.complete
     assert not after.warnings
-    # The rig is the first message: what has any has it.
     assert after.parameters == (open_recording(full).parameters if before else {})
     assert after.hello == (HELLO if before else None)
     got, expected = theirs(folder), theirs(full)

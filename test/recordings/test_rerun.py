@@ -112,7 +112,6 @@ def test_a_loss_breaks_every_line(tmp_path: Path) -> None:
     # bags/make.py: block 50 has too few samples, blocks 100 to 106 are gone.
     assert breaks == pytest.approx([50.0, 100.0], abs=0.01)
     assert [(t - start) / 2e7 for t, row in rows['psd_1/plane/dot'] if row is None] == pytest.approx([100.0], abs=0.01)
-    # The plate is said once, and again after each break.
     assert [row is None for _, row in rows['rig/tip/plate']] == [False, True, False, True, False]
     lost = {round((t - start) / 2e7): row for t, row in rows['lost']}
     assert (lost[100], lost[106]) == ((20,), (20,))

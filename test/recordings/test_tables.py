@@ -86,7 +86,6 @@ def test_loads_are_held_and_references_stand_once() -> None:
     columns = {c.name: np.asarray(c.values) for c in made.columns}
     np.testing.assert_array_equal(columns['load_fy'], [np.nan, -1.0, 2.0, 2.0])
     np.testing.assert_array_equal(columns['load_tz'], [np.nan, 0.0, 3.0, 3.0])
-    # The last one comes after the last sample.
     np.testing.assert_array_equal(columns['ref_dx'], [1e-3, np.nan, 4e-3, np.nan])
     assert [c for c in columns if c.startswith('temp')]
     (warm,) = [columns[c] for c in columns if c.startswith('temp')]
@@ -162,7 +161,6 @@ def test_every_channel_is_drawn_with_the_marks() -> None:
     samples['y2'] = [1.0, 2.0, 3.0]
     chart = samples_chart(samples, 2, moments([Mark(5_250_000_000, 'bump')], 5_000_000_000))
     assert [panel.y_label for panel in chart.panels] == [f'{n} / V' for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')]
-    # Its words are beside it once.
     words = ['bump', *[''] * 5]
     assert [[(rule.at, rule.words) for rule in rules] for rules in chart.rules()] == [[(0.25, w)] for w in words]
     (curve,) = chart.panels[4].series

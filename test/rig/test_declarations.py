@@ -68,7 +68,6 @@ def test_every_parameter_reaches_its_field_and_nothing_else(name: str) -> None:
     (changed,) = (i for i, (a, b) in enumerate(zip(before, after, strict=True)) if a != b)
     assert after[changed] == (tuple(value) if isinstance(value, list) else value)
     assert name == PARAMETERS[changed].name
-    # The ways lead to the same rig.
     assert rig_from_values(rig.flat()) == rig == load_rig(overrides={name: value})
 
 
@@ -250,7 +249,6 @@ def test_effects_are_put_into_the_users_file(tmp_path: Path) -> None:
     after = load_rig(path)
     assert after.values == before.values
     assert dict(after.effects) == {f'sensor_rotation_2.{key}': value for key, value in rotation.items()}
-    # Without effects it is the file without its own.
     path.write_text(with_effects_section(USERS_FILE, {}, path))
     assert load_rig(path).effects == {}
 

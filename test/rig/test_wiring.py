@@ -55,7 +55,6 @@ def test_rig_file_with_wiring_gives_nominal_estimates(wiring: Wiring) -> None:
     known = rig_from_values(values_of(wiring))
     wired, blocks = records_of(known, known)
     assert wired == nominal
-    # What is published and recorded stays as the device sends it.
     np.testing.assert_array_equal(wiring.to_psds(blocks[0].volts), straight[0].volts)
     assert not np.array_equal(blocks[0].volts, straight[0].volts)
     mistaken, _ = records_of(known, load_rig())

@@ -96,7 +96,6 @@ def start(domain: int) -> Iterator[Callable[..., Program]]:
     yield begin
     for daemon in started:
         daemon.end(signal.SIGTERM)
-        # pytest shows it if the test failed.
         print(*daemon.lines[-50:], sep='\n')
 
 

@@ -77,15 +77,12 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
     peer.until(lambda: 'once it is enabled' in compensator.text, 'the node')
     states = peer.collect(DiagnosticArray, '/diagnostics')
     peer.until(lambda: len(states) > 1, 'its diagnostics')
-    # Silent until it is enabled: only the plant's own zeros.
     assert len(plant.offsets) == 1
     free = plant.error()
     assert free > 2e-3
-    # Closed.
     assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
     peer.until(lambda: plant.error() < 0.02 * free, 'an error of less than 2 %')
 
-    # Held.
     for topic, fault, why in (
         ('notify', *DEFLECTIONS['not finite']),
         ('notify', *DEFLECTIONS['silent']),
@@ -107,7 +104,6 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
         plant.notify = plant.notify_joints = faithful
         peer.until(lambda stated=stated: 'following' in compensator.text[stated:], 'following')
     assert [s.name for s in states[0].status] == ['compensator: offsets']
-    # Handed over: it ends at no offset.
     compensator.process.send_signal(2)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
     assert compensator.wait() == 0
@@ -286,7 +282,6 @@ def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> 
         peer.until(lambda: plant.error() > 2e-3, 'a deflection')
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
         peer.until(lambda: 'holding: the robot does not run' in node.text, 'that it does not run')
-        # Silent: it does not know the robot yet.
         assert len(plant.offsets) == 1
         runs.publish(Bool(data=True))
         peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
@@ -382,7 +377,6 @@ def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> No
         states = peer.collect(DiagnosticArray, '/diagnostics')
         count = len(plant.offsets)
         peer.until(lambda: len(states) > 1, 'diagnostics of the second')
-        # It was told what is applied, and is silent until it is enabled.
         assert len(plant.offsets) == count
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
         peer.until(lambda: 'following' in first.text, 'that it follows')
@@ -392,7 +386,6 @@ def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> No
         peer.until(lambda: 'another node publishes /compensator/offsets' in first.text, 'that it is not alone')
         assert peer.call(SetBool, '/other/enable', SetBool.Request(data=True)).success
         peer.until(lambda: 'holding: another node publishes' in second.text, 'that the other is not alone')
-        # The first one holds, and the other one has nothing to say.
         now = len(plant.offsets)
         peer.until(lambda: len(plant.offsets) > now + 50, 'offsets')
         assert np.ptp(plant.offsets[now:], axis=0).max() == 0.0

@@ -676,9 +676,6 @@ def test_interrupt_ends_it_with_status_0(running: Running) -> None:
     assert not any('Traceback' in line for line in running.program.lines)
 
 
-# Of the source, not of a node.
-
-
 def test_every_node_of_the_room_is_an_executable() -> None:
     modules = {path.stem: ast.parse(path.read_text()) for path in ROS.glob('*.py')}
     names = {

@@ -289,7 +289,6 @@ def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., An
             assert (vector.x, vector.y, vector.z) == tuple(row[f'{c}{number}'] for c in ('x', 'y', 'sum'))
     daemon.send(signal.SIGINT)
     assert daemon.wait() == 0, daemon.lines
-    # The recording has the same frames, the samples once, and the node's name.
     (folder,) = tmp_path.glob('psd_*')
     with Reader(folder) as bag:
         kept = {c.topic for c in bag.connections}

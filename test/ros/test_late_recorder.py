@@ -102,7 +102,6 @@ def test_velocity_and_filtered_pose_replay_bit_for_bit(
     for force in (0.0, -10.0):
         message = WrenchStamped()
         message.wrench.force.y = force
-        # The same load again is no new one.
         for _ in range(5):
             load.publish(message)
             peer.until_of_now(speeds, 'velocities after the load')
@@ -138,7 +137,6 @@ def test_velocity_and_filtered_pose_replay_bit_for_bit(
     recording = open_recording(folder)
     annotated = [name for change in recording.changes for name, _ in change.values]
     assert annotated.count(KNOWN_LOAD) == 2
-    # Recorded is what the filter was told, and no more.
     bases = [base for _, base in recording.accelerations()]
     assert 10 <= len(bases) == recording.topics()['/link_base/acceleration'] <= reported * 8 // 10
     assert {base.angular[0] for base in bases} <= {0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0}

@@ -97,12 +97,10 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert (len(poses), len(markers)) == (stopped, drawn)
     assert change(peer, Transition.TRANSITION_CLEANUP)
     SerialPort(simulated_port, 921_600).close()
-    # What was recorded went on while nothing was published, and is whole.
     (folder,) = bags.iterdir()
     recording = open_recording(folder)
     assert recording.complete
     assert recording.topics()['/link_tip/deflection'] > stopped + 50
-    # Round again.
     assert change(peer, Transition.TRANSITION_CONFIGURE)
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     peer.until(lambda: len(poses) >= stopped + 10, 'estimates once more')
@@ -163,7 +161,6 @@ def test_parameters_set_unconfigured_are_kept(
     reported = json.loads(rigs[-1].data)['parameters']
     assert [reported[n] for n in ('block_size', 'sum_min', 'effects.axis_crosstalk.xy')] == [10, 2.4, 0.02]
     assert value_of(peer, 'solvers')[0] == 'ols'
-    # Half a block: the stamps are closer.
     assert min(stamp(b) - stamp(a) for a, b in itertools.pairwise(poses)) < 15_000_000
     for fixed in ({'port': '/dev/other'}, {'effects__axis_crosstalk__xy': 0.03}):
         assert 'is read when the node is configured' in put(peer, **fixed)
@@ -184,7 +181,6 @@ def test_parameters_set_unconfigured_are_kept(
     topics = dict(peer.node.get_topic_names_and_types())
     peer.until(lambda: peer.node.count_publishers('/link_tip/markers') == 0, 'the markers to be gone')
     assert '/link_tip/wls/deflection' in topics
-    # A zero that was set by hand meanwhile holds, as a rig file that was edited does.
     cycle(peer, 'deactivate', 'cleanup')
     assert put(peer, psd_1__zero=[0.0004, 0.0]) == ''
     cycle(peer, 'configure')

@@ -140,7 +140,6 @@ def test_goal_is_shaped_with_result_of_controller(begin: Callable[..., Arm]) -> 
     assert arm.controller is not None
     (sent,) = arm.controller.goals
     begun, path = arriving(sent.trajectory, NAMES)
-    # It begins where the joints are, ends where it was to end, and takes longer by the shaper.
     assert np.allclose(path.states[0, 0], START, atol=1e-9)
     assert path.states[-1, 0].tolist() == [0.5, 0.1]
     assert path.duration == pytest.approx(0.3 + 0.0834, abs=1e-3)

@@ -64,7 +64,6 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
 
     unknown = 'nobody tells where the joints are on joint_states'
     peer.until(lambda: any(r.status[0].message == unknown for r in reports), 'diagnostics without joints')
-    # Rejected: a joint of which nobody tells anything, too.
     given.publish(message(point(0.0, [0.0]), names=('z',)))
     node.until('trajectory rejected: the position of z is not known')
     reported(peer, shoulder=START[0], elbow=START[1])
@@ -77,7 +76,6 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
     peer.until(lambda: any('was rejected: its stamp' in r.status[0].message for r in reports), 'diagnostics')
 
     good = message(point(0.0, START.tolist()), point(MOVE_S, END.tolist()))
-    # Many leave zeros there.
     good.points[0].effort = [0.0, 0.0]
     # Shaped: stamp and frame are kept, and the link is at rest when the joints are.
     begun = time.time_ns()
@@ -95,7 +93,6 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
     shaped = heard[0]
     assert shaped.joint_names == list(NAMES)
     assert shaped.header.frame_id == 'arm'
-    # It begins when it has arrived, and says so.
     assert stamp(shaped) >= begun + 100_000_000
     assert list(shaped.points[0].positions) == START.tolist()
     assert list(shaped.points[-1].positions) == END.tolist()
@@ -118,7 +115,6 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
     node.until('trajectory rejected: another node publishes /shaper/shaped')
     peer.node.destroy_publisher(twin)
 
-    # A stop goes through.
     heard.clear()
     given.publish(message())
     peer.until(lambda: any(not h.points for h in heard), 'the stop')

@@ -218,7 +218,6 @@ def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
     peer.until(lambda: len(rest) >= 1, 'the latched markers')
     assert {m.ns for m in rest[0].markers} == {'link_at_rest', 'laser', 'beam'}
     assert {m.ns for m in moves[-1].markers} == {'link', 'plate', 'psd', 'dot'}
-    # The beams stand where the unloaded dots are.
     put = Parameter('psd_1.zero', value=[0.001, 0.0]).to_parameter_msg()
     peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
     x = RIG.psds[0].center[0] + 0.001

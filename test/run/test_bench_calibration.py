@@ -69,7 +69,6 @@ class Bench:
 def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) -> None:
     bench = Bench(bag, tmp_path / 'growing')
     first, half, full = list(bench.steps())
-    # What was written by then holds no block.
     assert first.progress is None
     assert first.answer is None
     assert 'holds no samples' in first.words
@@ -80,7 +79,6 @@ def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) 
     left = [sum(parameter.left for parameter in progress.parameters) for progress in (half.progress, full.progress)]
     assert left[1] < left[0]
     assert half.progress.seconds < full.progress.seconds == pytest.approx(len(LOADS), abs=0.01)
-    # It looks at what has grown only, and not more often than it says.
     assert bench.looks[1] - bench.looks[0] >= LEAST_PAUSE_S
     assert bench.looks == pytest.approx([0.0, 3.0, 5.0], abs=2 * LOOK_S)
 

@@ -203,7 +203,6 @@ def test_estimates_flow_while_disk_hangs_at_end(live: Live, disk: Disk) -> None:
     ended = live.session.record(False)
     assert disk.is_reached()
     live.flow()
-    # The next recording waits for its own disk alone.
     second = live.record(True)
     assert second != first
     live.flow()
@@ -260,7 +259,6 @@ def test_a_start_that_hangs_can_be_ended(live: Live, disk: Disk, tmp_path: Path)
     assert folder is not None
     live.flow()
     assert live.record(False) == folder
-    # Of the one that did not begin nothing is left.
     assert list((tmp_path / 'bags').iterdir()) == [folder]
 
 
@@ -379,7 +377,6 @@ def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, disk: Disk, t
         path = tmp_path / 'zero.json'
         return json.loads(path.read_text())['psd_1.zero'] if path.exists() else None
 
-    # The end waits for it, with a limit.
     until(lambda: kept() == [1e-4, -2e-4])
     live.session.close()
     assert kept() == [1e-4, -2e-4]

@@ -313,7 +313,6 @@ def test_network_run_is_recorded_and_replays_exactly(
     assert session.acquisition.counters.bad == 0
     assert main(['replay', str(folder), '--compare', '--strict']) == 0
     assert 'no bit differs' in capsys.readouterr().out
-    # The device is there for the next one.
     again = Acquisition(load_rig(overrides={'port': served}), texts(logged.append))
     again.open()
     again.start()

@@ -109,7 +109,6 @@ def test_lines_about_estimates_come_once_a_second_with_counts() -> None:
     assert 9 <= len(logged) <= 11
     assert logged[0] == 'no estimate: laser 1 lost'
     assert '25 blocks affected' in logged[1] or '26 blocks affected' in logged[1]
-    # And nothing while nothing changes.
     before = len(logged)
     for i in range(500):
         outages.block('', '', 30.0 + 0.02 * i)

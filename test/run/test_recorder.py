@@ -96,9 +96,7 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, dis
     assert run.recorder.folder is None
     assert run.recorder.failure in text
     with Reader(run.folder) as reader:
-        # The rig is in each file besides.
         assert reader.message_count == run.recorder.written + 1
-    # What comes after is passed over; the next recording starts again where there is room.
     run.put(1)
     with pytest.raises(RecordingError, match=r'150 MB left, .*; make room, or record elsewhere'):
         run.start(rig_for(tmp_path, disk_reserve=200 * MB))
@@ -125,7 +123,6 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
     if how == 'moved':
         assert [b.index for b in open_recording(tmp_path / 'elsewhere').blocks()][:1] == [0]
         assert (tmp_path / 'elsewhere' / 'metadata.yaml').is_file()
-    # The next one starts in a folder of its own.
     assert run.start(rig_for(tmp_path)).is_dir()
     run.stop()
 
@@ -194,7 +191,6 @@ def test_the_oldest_file_is_deleted_where_that_was_asked_for(
     assert mine.exists()
     assert run.indices() == list(range(50, module.LOOK_EVERY))
     with Reader(run.folder) as reader:
-        # The rig is in each file besides.
         assert reader.message_count == module.LOOK_EVERY - 50 + len(list(run.folder.glob('*.mcap')))
 
 

@@ -106,7 +106,6 @@ def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> 
     assert found[('psd_deflection_estimates_total',)] >= 5.0
     assert found[('psd_deflection_messages_rejected_total', LOAD)] == 1.0
     assert found[('psd_deflection_recording',)] == 0.0
-    # The device measures none, and nothing watches.
     assert not any('celsius' in key[0] or 'watch' in key[0] for key in found)
 
 
@@ -119,7 +118,6 @@ def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, d
     assert STALE not in dict(description_of_dots())
     device.unplug()
     running.heard('waiting for it to come back')
-    # What came before the unplugging is told once more.
     description_of_dots()
     assert description_of_dots() == [(STALE, 'no samples')] * 2
 
@@ -288,7 +286,6 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     assert isinstance(now, ReferencePose)
     assert now.t_ns > good.t_ns
     assert observed.records == [good, now]
-    # Both are counted, and the last reason is told.
     running.session.processing.request(lambda: None)
     assert running.session.rejected == {REFERENCE: 2}
     entry = HealthReporter(running.session).report(0).entries[0]

@@ -156,7 +156,6 @@ def test_samples_without_room_are_reported_and_counted(
     shown = capsys.readouterr().out
     assert f'{dropped} samples, 0 messages: the host that recorded was too slow' in shown
     assert f'{taken} present, ' in shown
-    # On the wire nothing was lost.
     assert session.acquisition.counters.lost == 0
 
 

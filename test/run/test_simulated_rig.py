@@ -66,7 +66,6 @@ def test_it_hangs_what_is_noted() -> None:
         observed.until(lambda dy: max(map(abs, dy)) < 3e-6)
     finally:
         session.close()
-    # What comes at the end, or after it, is hung nowhere.
     session.note_load(0.0, -10.0, 0.0)
 
 

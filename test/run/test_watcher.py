@@ -131,7 +131,6 @@ def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
     )
     recording = open_recording(folder)
     assert recording.hello == {'serial': 'abc'}
-    # The run had measured its noise before the recording begins.
     again = replayed_estimates(recording, rig_at_start(recording))
     assert len(again.t_ns) > 800
     assert [chain.poses[t] for t in again.t_ns.tolist()] == [tuple(p) for p in again.pose.tolist()]
@@ -271,7 +270,6 @@ def test_what_was_kept_is_bounded_in_bytes(tmp_path: Path) -> None:
     chain.feed(0.2)
     folder = an_alarm(chain)
     assert not big.exists()
-    # The newest stays, however large.
     assert folder.exists()
 
 

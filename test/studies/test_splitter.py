@@ -67,7 +67,6 @@ def test_failed_laser_costs_certainty_or_warm_up() -> None:
     assert max(p.largest for p in (both, out, alone, spare)) < 5.0
     # Where the dots leap, the tip seems to: half a dot's distance if both shone, all of it for a spare.
     assert [p.off[0] for p in (both, out, alone, spare)] == pytest.approx([0.0, -5e-4, 0.0, -1e-3], abs=1e-6)
-    # A spare that is on at once loses nothing.
     assert [p.name for p in simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.0))][-2:] == ['laser 1 alone', 'its spare']
 
 

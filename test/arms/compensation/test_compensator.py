@@ -114,7 +114,6 @@ def test_a_payload_is_compensated_to_one_part_in_hundred(arm: Arm) -> None:
     assert command.state is State.FOLLOWING
     assert not command.limited
     assert loop.error() < 0.01 * before
-    # Elsewhere too, and without the payload.
     elsewhere = np.array([0.7, 1.4])
     loop.run(1.5, elsewhere)
     assert loop.error(elsewhere) < 0.01 * before
@@ -517,7 +516,6 @@ def test_switch_off_in_silence_returns_offsets_later(arm: Arm) -> None:
     assert loop.run(0.5).state is State.OFF
     assert len(loop.sent) == count
     assert np.array_equal(loop.offsets, left)
-    # Not while somebody else commands the robot.
     loop.reports = True
     loop.compensator.stop(OTHER_PUBLISHER, other_publisher=True)
     loop.run(0.2)
@@ -526,7 +524,6 @@ def test_switch_off_in_silence_returns_offsets_later(arm: Arm) -> None:
     assert loop.run(float(np.abs(left).max()) / 0.1 + 0.1).state is State.OFF
     assert not loop.offsets.any()
     assert loop.step() <= 1.0 + 1e-9
-    # Then it is silent.
     count = len(loop.sent)
     loop.run(0.5)
     assert len(loop.sent) == count
@@ -735,7 +732,6 @@ def test_commands_hold_for_stopped_or_moved_arm(arm: Arm) -> None:
         loop.compensator.controller_has(loop.t, loop.has)
         loop.compensator.observe(loop.t, observed(loop, t=loop.t))
         command = loop.send(loop.t)
-        # At once, and not when it has asked for much more.
         assert np.array_equal(command.offsets, before) or not command.sends
     assert command.state is State.HOLDING
     assert 'is 0.03 from what it was sent' in command.why

@@ -68,7 +68,6 @@ def test_it_is_the_solution_of_the_equation_of_motion() -> None:
         BaseAcceleration(12 * MS, NONE, NONE),
     ]
     known = Inertia(MODES, L)
-    # In any order, and twice.
     for i in (2, 0, 1, 1):
         known.notify(reported[i], 0)
     seconds = 1e-3 * np.arange(1.0, 21.0)
@@ -92,7 +91,6 @@ def test_acceleration_holds_0_1_s_and_starts_uncertain() -> None:
     np.testing.assert_allclose(found.at[..., :2], integrated(changes, seconds), rtol=1e-7, atol=1e-13)
     # It may have begun before it was told, and nobody knows how it ended.
     assert found.doubt[0] == pytest.approx(2.0 / MODES[0].w ** 2)
-    # One that comes too late to be the next is a first one again.
     known.notify(BaseAcceleration(111 * MS, (1.0, 0.0, 0.0), NONE), 100 * MS)
     assert known.forced(0, seconds[:150]).doubt[0] == pytest.approx(3.0 / MODES[0].w ** 2)
     known.forget_before(10 * MS + HOLD_NS)

@@ -113,7 +113,6 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(operation: motion.Run
     replay = Pipeline(RIG)
     replay.apply(memory)
     assert through(replay, dark, range(start, 300)) == expected
-    # And it would not be the same without.
     without = Pipeline(RIG)
     without.apply(streams.without(memory, STATE))
     assert through(without, dark, range(start, 300)) != expected

@@ -195,7 +195,6 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
 def test_diagnostics_say_whose_noise_it_is(flat: bool, words: str) -> None:
     estimator = BlockEstimator(load_rig(), flat)
     assert dict(estimator.words())['covariance from'] == words
-    # The noise of each reading is told if it is measured.
     assert len(estimator.words()) == (6 + len(estimator.noise_words()) if flat else 5)
     assert len(estimator.noise_words()) >= 4
 

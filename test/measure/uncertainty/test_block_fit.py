@@ -228,9 +228,6 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
     assert misfits > 0
 
 
-# ---- motion that goes on alike
-
-
 def shaken(fit: BlockFit, hz: float, amplitude: float, blocks: int, seed: int = 5) -> tuple[FloatArray, FloatArray]:
     """Error over standard deviation (n,) of x1, and that (n,), of both plates' x that sway along with white noise."""
     rng = np.random.default_rng(seed)

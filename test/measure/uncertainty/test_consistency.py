@@ -37,8 +37,6 @@ def residual_of(readings: FloatArray, slopes: FloatArray, covariance: FloatArray
     return np.asarray(unknowns, dtype=np.float64), float(residual @ residual)
 
 
-# Two PSDs.
-
 REST = (0.100, 0.070)
 COVARIANCE = np.diag([4e-12, 1e-12, 9e-12, 2e-12]) + 0.5e-12
 # d(x1, y1, x2, y2)/d(dX, dY, theta) at rest: -1, and the place turned by a right angle.
@@ -56,7 +54,6 @@ def test_excess_of_the_base_line_is_that_of_least_squares(seed: int) -> None:
     residual = readings - DESIGN @ np.linalg.lstsq(DESIGN, readings, rcond=None)[0]
     got = two().update(BaseLineExcess(REST, tuple(residual.tolist()), COVARIANCE), 1.0, None)
     assert got.chi_square == pytest.approx(residual_of(readings, DESIGN, COVARIANCE)[1], rel=1e-9)
-    # Of each reading the error that alone explains all: with it taken off nothing is left.
     for i, error in enumerate(got.errors):
         true = readings - error * np.eye(4)[i]
         assert residual_of(true, DESIGN, COVARIANCE)[1] == pytest.approx(0.0, abs=1e-9)
@@ -113,8 +110,6 @@ def test_covariance_is_widened_by_each_error_alone() -> None:
     want = own + sum(np.outer(gain[:, i] * e, gain[:, i] * e) for i, e in enumerate(errors))
     np.testing.assert_allclose(widened(own, gain, errors), want, rtol=1e-12, atol=1e-24)
 
-
-# Four PSDs.
 
 RNG = np.random.default_rng(7)
 PSDS, UNKNOWNS = 4, 3
@@ -225,7 +220,6 @@ def test_two_outlier_candidates_stay_with_both_errors() -> None:
     assert (got.excluded, got.contradict) == (0, True)
     want = 1.5 * 2.0**0.5 * np.abs(got.errors) * np.repeat([1, 0, 1, 0], 2)
     np.testing.assert_allclose(got.possible, want, rtol=1e-12)
-    # One that was to blame alone before still is.
     checks = four()
     check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {3})
     assert check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {1, 3}).excluded == 3

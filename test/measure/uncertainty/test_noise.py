@@ -88,7 +88,6 @@ def test_restless_rig_takes_noise_colour_of_base_line() -> None:
     feed(noise, coloured(10 * SEGMENT, 0.6, 8) + ringing(10 * SEGMENT))
     assert not rested(noise)
     np.testing.assert_allclose(noise.mean_sd(), SIGMA * mean_variance(0.6) ** 0.5, rtol=0.25)
-    # And the first rest replaces it.
     feed(noise, coloured(10 * SEGMENT, 0.6, 9), 10 * SEGMENT_BLOCKS)
     assert rested(noise)
     np.testing.assert_allclose(noise.mean_sd(), SIGMA * mean_variance(0.6) ** 0.5, rtol=0.12)

@@ -122,7 +122,6 @@ def test_a_vibration_is_counted_and_named(hz: float) -> None:
     s = shaken(hz, seconds=8)
     assert s.inside.three > 0.99
     assert min(s.inside.axes) > 0.93
-    # And by no more than it is: three times, where the polynomials begin to follow it.
     assert s.inside.rms[1] > s.sd[1] / 1.2
     assert s.named == 1.0
     assert s.words == f'vibrates: 14 µm rms near {hz:g} Hz'
@@ -146,7 +145,6 @@ def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
     noisy.set_segment(block, (1.0, 2.0, 3.0, 4.0))
     assert noisy.segment() == block
     assert noisy.sums() == (1.0, 2.0, 3.0, 4.0)
-    # One that looked for no tones told none.
     noisy.set_segment(block)
     assert noisy.sums() == (0.0,) * 4
     assert noisy.buffered == len(block) + 4

@@ -132,7 +132,6 @@ def test_worst_cause_is_first_and_both_psds_are_faulty() -> None:
     both = classify(changed(5, 0.0), far)
     assert (both.status, both.faulty, both.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1, 2}))
     assert both.reason.startswith('laser 2')
-    # Of one detector the cause, not what it causes.
     assert classify(changed(2, 0.0), far).reason.startswith('laser 1')
     assert classify(changed(3, 10.0), (*DOTS[:2], 1.0, 0.0)).status is BlockStatus.SATURATED
 
@@ -170,7 +169,6 @@ def test_faultless_detectors_are_sound_with_enough_samples() -> None:
     assert classify((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).sound == ()
     assert classify(changed(2, 0.0), present=9).sound == ()
     assert classify(changed(2, 0.0), present=10).sound == (1,)
-    # Of two lost lasers the first is named.
     assert classify((*GOOD[:2], 0.0, *GOOD[3:5], 0.0)).reason.startswith('laser 1')
 
 

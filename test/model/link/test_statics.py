@@ -45,9 +45,6 @@ def test_soft_clamp_rotates_by_moment_and_torque() -> None:
     assert theta == pytest.approx(5.0 * (0.585 / 1042.0 + 2e-4), rel=1e-14)
 
 
-# ---- Cross-section ----
-
-
 def test_the_section_of_the_thesis_link() -> None:
     assert SECTION.second_moment == pytest.approx(2.171272689e-8, rel=1e-9)
     assert SECTION.polar_moment == pytest.approx(4.342545378e-8, rel=1e-9)

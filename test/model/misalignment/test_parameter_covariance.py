@@ -101,7 +101,6 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     after = estimates(records)['exact']
     assert before.covariance[0] ** 0.5 > 0.9e-6
     assert after.covariance[0] ** 0.5 < 0.5e-6
-    # As it was recorded, bit for bit; and a recording that starts now tells the same.
     for reported in (change, pipeline.memory(rig)):
         assert isinstance(reported, ParameterChange)
         assert ZERO_VARIANCES in dict(reported.values)
@@ -134,7 +133,6 @@ def test_a_zero_from_elsewhere_is_taken_for_one_of_25_blocks() -> None:
     noise = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
     np.testing.assert_allclose(pipeline.estimation.zero_variances, [noise / 25.0] * 4, rtol=1e-9)
     assert pipeline.tip_loads.zeroed
-    # Another parameter is none.
     other = Pipeline(calibrated())
     other.change({'sum_min': 0.5})
     assert (other.estimation.zero_variances, other.tip_loads.zeroed) == ((), False)

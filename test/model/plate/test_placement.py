@@ -130,7 +130,6 @@ def test_one_place_is_no_room_for_two_and_two_are() -> None:
     assert len(room.candidates()) == 2
     pair = placement.best_pair(room)
     assert room.holds(pair).all()
-    # As far apart as the box allows: its two corners on the rim and below.
     assert pair == pytest.approx(np.array([[0.0999, math.sqrt(0.1**2 - 0.0999**2)], [0.0999, 0.001]]), abs=1e-8)
 
 
@@ -159,7 +158,6 @@ def test_placement_deviations_are_dense_least_squares() -> None:
     jacobian = np.stack(columns, axis=1)
     want = SIGMA * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     assert placement.pose_deviations(pose, centers, heights, SIGMA) == pytest.approx(want, rel=1e-5)
-    # With the tilts tied by k = 1.5 and k unknown; rows are dX, dY, theta, k.
     flat = np.array([1e-3, -2e-3, 0.02])
 
     def tied(x: FloatArray) -> FloatArray:

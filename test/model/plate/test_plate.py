@@ -63,7 +63,6 @@ def test_the_dots_are_where_the_rays_meet_the_plate(rays: Any) -> None:
         ),
         points,
     )
-    # One beam and pose at a time, in floats.
     for i in range(len(POSES)):
         dx, dy, theta, phi, omega = POSES[i].tolist()
         for j in range(3):
@@ -71,7 +70,6 @@ def test_the_dots_are_where_the_rays_meet_the_plate(rays: Any) -> None:
             qx, qy, row_x, row_y = crossing((lx, ly, float(heights[j])), (dx, dy, theta, phi, omega))
             assert (qx, qy) == pytest.approx(points[i, j], abs=1e-16)
             assert np.array([row_x, row_y]) == pytest.approx(jacobian[i, j], abs=1e-14)
-    # A beam of its own for each pose.
     many = np.broadcast_to(beams, (6, 3, 2))
     np.testing.assert_array_equal(crossings(POSES, many, heights)[1], jacobian)
 
@@ -265,7 +263,6 @@ def test_no_error_exceeds_the_bound(golden: Any, scaling: Any, lacking: float) -
         got = np.linalg.lstsq(po[:, None] * used, po * observed, rcond=None)[0]
         share.append(np.abs(got - pose) / error_bound(used, got, design_error, reading_error, po))
     assert np.max(share) <= 1.0
-    # It says something: some trial comes near it in each component.
     assert (np.max(share, axis=0) > 0.5).all()
 
 

@@ -95,7 +95,6 @@ def test_it_is_discovered_and_named(rig: Rig, tmp_path: Path) -> None:
     k = named['parameters']['k']
     assert k['unit'] == '1/K'
     assert abs(k['value'] - 2e-4) < 4.0 * k['sd']
-    # The model that discover leaves is one that the pipeline corrects with.
     assert Pipeline(load_rig(out / 'model.yaml')).needs_temperature
 
 
@@ -161,7 +160,6 @@ def test_a_broken_file_is_named_with_the_cause(folder: Path, code: str, message:
             load()
         assert str(file) in str(error.value)
         assert message in str(error.value)
-    # Whoever does not use it is not disturbed.
     Pipeline(load_rig())
     Pipeline(load_rig(overrides={'effects.one.name': 'sensor_gain', 'effects.one.psd': 1, 'effects.one.x': 0.01}))
 
@@ -170,7 +168,6 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setenv(FOLDERS, str(tmp_path / 'efects'))
     with pytest.raises(ConfigError, match=rf'{FOLDERS}: .*efects: cannot be read'):
         effect_names()
-    # Nobody needs the default one, and a rig without effects none.
     Pipeline(load_rig())
     monkeypatch.delenv(FOLDERS)
     monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))

@@ -82,7 +82,6 @@ def test_a_law_acts_on_what_it_names(target: str) -> None:
         assert moved.any()
         assert not moved[rest].any()
     else:
-        # What moves the link shows on all PSDs.
         assert moved.reshape(6, 3)[:, :2].any(axis=1).all()
 
 
@@ -155,7 +154,6 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
     for name in ('a', 'a.mcap'):
         assert main([*words, '--out', str(tmp_path / name)]) == 0
     observed = psd_deflection.replay(tmp_path / 'a')
-    # What discover writes for others.
     (active,) = effects_of_rig(load_rig(by_hand))
     model = tmp_path / 'model.yaml'
     model.write_text(described(load_rig(by_hand), [active]))

@@ -88,7 +88,6 @@ def test_the_served_rig_is_loaded_a_second_after_power_up() -> None:
     got, cycle = served.take(5000 + 36_000), loads.thesis_load_cases().loads
     assert not got[:1000].any()
     np.testing.assert_array_equal(got[1000:5000], np.tile(loads.sidebar(10.0), (4000, 1)))
-    # Then as ever: the whole cycle, unloaded case and all.
     np.testing.assert_array_equal(got[-3000:], cycle[5000:8000])
 
 
@@ -199,7 +198,6 @@ def test_a_lag_is_exact_just_after_a_load_step_too(tau: float) -> None:
     lag = make_active('amplifier_lag', {'time_constant': tau}, 'test')
     np.testing.assert_allclose(effect_volts(lag), expected[:, :-1:FINER], rtol=0.0, atol=3e-7)
     assert np.abs(expected - fine).max() > 1e-2
-    # And read late.
     skew = make_active('channel_skew', {'psd': 1, 'delay': 0.4e-3}, 'test')
     late = np.concatenate((np.repeat(fine[:3, :1], 4, axis=1), expected[:3, :-4]), axis=1)
     np.testing.assert_allclose(effect_volts(lag, skew)[:3], late[:, :-1:FINER], rtol=0.0, atol=3e-7)

@@ -204,7 +204,6 @@ def test_a_dot_that_is_no_number_has_no_status_ok(golden: Any, method: str, opti
     assert solver.solve(bad, VARIANCES['equal']).status != 0
     many = solver.solve_many(np.array([good, bad, good]), np.array(VARIANCES['equal']))
     assert many.status[1] != 0
-    # Its neighbours are none the worse.
     one = solver.solve(good, VARIANCES['equal'])
     np.testing.assert_allclose(many.pose[[0, 2]], [one[:3], one[:3]], rtol=0, atol=1e-14)
     assert many.status[[0, 2]].tolist() == [one.status] * 2
@@ -242,7 +241,6 @@ def test_what_cannot_be_observed_is_not_converged() -> None:
 
 def test_endless_steps_end() -> None:
     def away(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
-        # The step is always one, whatever x.
         return [0.0], [(1.0,)]
 
     one = fit(away, (0.0,), (1.0,), (1.0,))

@@ -116,7 +116,6 @@ def test_results_that_wait_for_an_earlier_one_are_bounded() -> None:
     names = [str(i) for i in range(200)]
     work = outcomes(length, names, Slow())
     assert next(work).name == '0'
-    # Nothing further was begun before the first was there.
     assert len(given) == 4 + AHEAD
     assert [o.name for o in work] == names[1:]
 
@@ -212,7 +211,6 @@ def test_a_list_is_relative_to_its_folder(archive: Path) -> None:
     (archive / 'b' / 'list.txt').write_text('\ufeff# the good ones\n\nlone.mcap\n  ../a/*  \n', encoding='utf-8')
     assert not is_plain('b/list.txt')
     assert listed(['b/list.txt', 'a/run_1']) == ['b/lone.mcap', 'b/../a/run_1', 'b/../a/run_2', 'a/run_1']
-    # There is none: the command says so.
     assert listed(['none.txt']) == ['none.txt']
 
 

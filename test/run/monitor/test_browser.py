@@ -311,7 +311,6 @@ def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Se
     page.until('Number(document.getElementById("ago").value) >= 3.4')
     page.driver.find_element(By.CSS_SELECTOR, '#weigh button[value=set]').click()
     page.until('document.getElementById("notice").textContent === "load noted"')
-    # What passed while the dialog was open counts too.
     (ago,) = serving.shown.agos
     assert ago is not None
     assert ago > 3.4
@@ -335,7 +334,6 @@ def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
     page.js('(() => { const s = document.getElementById("seek"); s.value = 3; s.onchange(); })()')
     page.until('document.getElementById("position").textContent.startsWith("3.0 of 4.0 s")')
     page.until(f'document.body.dataset.rows > {before + 50}', 'the rows up to there')
-    # Backwards too: the traces start again.
     page.js('(() => { const s = document.getElementById("seek"); s.value = 1; s.onchange(); })()')
     page.until('document.getElementById("position").textContent.startsWith("1.0 of 4.0 s")')
     for button in ('record', 'load', 'mark'):

@@ -61,7 +61,6 @@ def test_it_shows_what_is_determined_and_ends_with_its_files(serve: Serve, bag: 
     ended = calibrations(serving.url, lambda c: not c['running'])
     assert ended['last'] == 'calibrated'
     assert {path.name for path in Path(ended['out']).iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
-    # The page asked for the recording and for its end.
     assert serving.shown.recordings == [str(bag), None]
     assert asked(serving.url, False) == (409, 'no calibration runs')
 

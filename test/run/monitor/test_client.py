@@ -120,7 +120,6 @@ def test_a_stop_of_the_calibration_is_never_lost(
     before = signal.getsignal(signal.SIGTERM)
     assert main([*CALIBRATE, str(out)]) == 0
     assert signal.getsignal(signal.SIGTERM) == before
-    # Nobody but us has ended the recording.
     assert serving.shown.recordings == [str(bag), None]
     assert {path.name for path in out.iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
 
@@ -131,7 +130,6 @@ def test_calibrate_needs_the_recording_on_this_machine(
     serving = serve()
     assert main([*CALIBRATE, str(tmp_path / 'out')]) == 4
     assert 'recordings/test: is not on this machine' in capsys.readouterr().err
-    # Who began it ends it.
     assert serving.shown.recordings == ['recordings/test', None]
 
 

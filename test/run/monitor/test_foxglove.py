@@ -100,7 +100,6 @@ def test_a_viewer_without_ros_sees_the_running_rig(start: Callable[..., Program]
     viewer = Viewer()
     wanted = ('/link_tip/deflection', '/link_tip/wrench', '/psd/samples', '/diagnostics', '/link_tip/rig')
     viewer.look(url, lambda got: all(topic in got for topic in wanted) and len(got['/link_tip/deflection']) > 50)
-    # Nobody can steer the rig from there.
     assert viewer.info['capabilities'] == []
     pose, wrench = viewer.decoded('/link_tip/deflection'), viewer.decoded('/link_tip/wrench')
     assert pose.header.frame_id == 'link_tip_rest'
@@ -109,7 +108,6 @@ def test_a_viewer_without_ros_sees_the_running_rig(start: Callable[..., Program]
     assert abs(wrench.wrench.force.y) < 100.0
     assert json.loads(viewer.decoded('/link_tip/rig').data)['parameters']['psd_1.center'] == [0.0, 0.07]
     assert any('acquisition' in s.name for s in viewer.decoded('/diagnostics').status)
-    # Another one that comes later gets the rig too.
     second = Viewer()
     second.look(url, lambda got: '/link_tip/rig' in got)
 

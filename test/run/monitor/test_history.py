@@ -188,7 +188,6 @@ def test_memory_is_taken_once_and_marks_are_bounded() -> None:
         made.mark(START_NS + k, f'[{k}]')
     assert made.bytes == before
     content = json.loads(made.answer(history.Asked(START_NS, START_NS + SECOND, 100)))
-    # The newest are shown; how many are not is said.
     assert content['marks'][-1] == [history.MOST_MARKS + 699]
     assert len(content['marks']) == history.SENT_MARKS
     assert content['marks_left_out'] == history.MOST_MARKS - history.SENT_MARKS

@@ -117,7 +117,6 @@ def test_cell_under_cursor_is_reported_and_zoom_loads(page: Page, hour: Serving)
     page.until(f'{CELL}.includes("blocks without an estimate")')
     ActionChains(page.driver).move_to_element_with_offset(plot, wide // 4, 0).perform()
     page.until(f'/ \\+ 6 s: ΔX .* \\(.* to .*\\) µm, ΔY .* µm, θ .* mdeg$/.test({CELL})')
-    # The mean of the cell is in the key too; the hours have no rows of the last minute.
     assert page.js('document.querySelector(\'[data-plot="shift"][data-series="1"] output\').textContent') != ''
     ActionChains(page.driver).click_and_hold().move_by_offset(wide // 8, 0).release().perform()
     page.until('document.getElementById("hold").getAttribute("aria-pressed") === "true"')

@@ -96,7 +96,6 @@ def test_two_runs_are_as_one(file_of: Open) -> None:
         for name, values in want.items():
             np.testing.assert_allclose(got[name], values, rtol=1e-12)
     assert [text for _, text in second.marks] == ['[1]', '[2]']
-    # The cell under way is replaced, not kept twice.
     file.save(second.unsaved())
     assert len(file.load(LATER, LATER).cells) == len(full.rings[1].between(0, full.rings[1].newest + 1))
 

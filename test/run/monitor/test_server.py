@@ -100,7 +100,6 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     assert reported == ['a message']
     health = next(m['health'] for m in messages if 'health' in m)
     assert health['entries'][0]['name'] == 'acquisition'
-    # A level that is changed while it runs reaches the page.
     assert health['sum_min'] == serving.rig.estimator.sum_min
 
 
@@ -209,7 +208,6 @@ def test_a_load_is_noted(serve: Serve) -> None:
     assert json.loads(ask(serving.url + 'api/step', body={})[1])['message'] == '3.40'
     assert ask(serving.url + 'api/play', body={'paused': True, 'seek': 2.5})[0] == 200
     assert serving.shown.played == [(True, 2.5)]
-    # Who paused it is of no interest later.
     assert [line for line in serving.logged if 'asked for' in line] == ['monitor: load was asked for by 127.0.0.1'] * 4
 
 
@@ -309,13 +307,11 @@ def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> No
     assert column(answer, 'blocks') == [50, 50, 6, 50]
     assert column(answer, 'estimates') == [50, 50, 4, 50]
     assert column(answer, 'lost') == [0, 0, 2 * 20 + 4 * 3, 0]
-    # dX swings by 1 mm with a period of 1.26 s.
     assert column(answer, 'dx_high')[0] == pytest.approx(1e-3, rel=1e-2)
     assert column(answer, 'dx_low')[0] == pytest.approx(-1e-3, rel=1e-2)
     assert column(answer, 'sum1') == [5.0] * 4
     assert [mark[1] for mark in answer['marks']] == ['mark', 'zero', 'alarm']
     assert answer['marks'][-1][2].startswith('x1 is +3.00 µm off')
-    # The same for a second browser, and in cells as wide as it wants them.
     assert column(history_of(serving, 40.0, points=10), 'blocks') == [156]
 
 
@@ -380,7 +376,6 @@ def test_idle_connections_do_not_use_up_the_daemons_files(serve: Serve) -> None:
         async with aiohttp.ClientSession() as session, session.ws_connect(serving.url + 'ws') as browser:
             assert 'hello' in (await browser.receive()).data
             idle = [await asyncio.open_connection('127.0.0.1', serving.port) for _ in range(CONNECTIONS + 20)]
-            # The oldest are ended; whoever looks on goes on, and the newest is heard.
             for reader, _ in idle[:20]:
                 assert await reader.read() == b''
             reader, writer = idle[-1]

@@ -167,11 +167,9 @@ def test_a_recording_can_be_paused_and_sought() -> None:
         assert source.play(None, seconds) == 'paused'
         goal = int(times[times >= start + seconds * 1e9][0])
         feed.until(lambda before=before, goal=goal: goal in feed.times[before:])  # type: ignore[misc]
-        # Played up to there, and no further.
         assert feed.times[-1] == goal
     described = source.describe()
     assert (described['paused'], described['load']) == (True, [0.0, -2.0, 0.0])
-    # Beyond the end it ends; from there it starts again.
     source.play(False, 9.0)
     assert ended.wait(60.0)
     assert feed.times[-1] >= times[-1]
@@ -230,7 +228,6 @@ def test_blocks_of_which_nothing_came_are_counted_with_the_next() -> None:
         feed.put(spots_of(index))
     feed.put(ParameterChange(START_NS, 4, ((RESTART, (70.0, 2000.0)),)))
     feed.put(spots_of(100))
-    # Those that did not fit were seen: they are no loss.
     feed.put(spots_of(101))
     assert [r.gone for r in feed.take() if isinstance(r, BlockResult)] == [0, 0, 2, 0, 0, 0]
     feed.put(spots_of(103))

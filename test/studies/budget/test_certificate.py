@@ -87,9 +87,6 @@ def certificate() -> Certificate:
     return certify(_problem())
 
 
-# ---- What the calibration left open ----
-
-
 def _weighted_pose(rig: Rig, read: FloatArray, pose: tuple[float, float, float]) -> FloatArray:
     """One step of weighted least squares from the true pose, the slopes by differences of the plate's exact model."""
     p = vector_of_rig(rig).as_used
@@ -127,7 +124,6 @@ def test_what_the_calibration_says_of_its_parameters(certificate: Certificate) -
     rows = {row.parameter: row for row in certificate.inputs if row.cause == 'calibration'}
     for name, sd in FOUND.items():
         assert rows[name].u == pytest.approx(sd, rel=1e-9)
-    # Of what it did not find the tolerance is known.
     assert rows['psd_2.rotation'].u == pytest.approx(0.010)
     assert {(row.observed, row.distribution) for row in rows.values()} == {(True, 'normal')}
     assert (rows['psd_1.rotation'].unit, rows['psd_1.gain_x'].unit, rows['psd_1.height'].unit) == ('rad', '', 'm')
@@ -162,16 +158,12 @@ def test_as_found_is_what_the_old_values_would_have_done(certificate: Certificat
     assert np.abs(certificate.found[0]).min() > 1e-7
 
 
-# ---- The reference and what acts since the zero ----
-
-
 def test_the_scale_of_the_reference_is_that_of_each_pose(certificate: Certificate) -> None:
     lengths, angles = (row for row in certificate.inputs if row.cause == 'reference')
     assert lengths.coefficients.tolist() == [[x, y, 0.0] for x, y, _ in POSES]
     assert angles.coefficients.tolist() == [[0.0, 0.0, theta] for *_, theta in POSES]
     assert (lengths.u, angles.u) == (2e-5, 1e-4)
     assert (lengths.unit, angles.unit, lengths.observed, angles.observed) == ('', '', False, False)
-    # One was stated; the other is a guess, known to a quarter.
     assert (lengths.freedom, angles.freedom) == (math.inf, 8.0)
 
 
@@ -190,9 +182,6 @@ def test_reading_shift_moves_pose_as_least_squares(certificate: Certificate) -> 
         for i, row in enumerate(noise):
             moved = exact + 1e-6 * np.eye(4)[i]
             assert row.coefficients[n] == pytest.approx(_weighted_pose(RIG, moved, pose) / 1e-6, rel=1e-5, abs=1e-6)
-
-
-# ---- The sums ----
 
 
 def test_default_poses_are_rest_and_observed_extremes() -> None:
@@ -229,9 +218,6 @@ def test_a_solver_that_is_linear_weighs_nothing() -> None:
     assert noise[0].coefficients[0, 0] + noise[2].coefficients[0, 0] == pytest.approx(-1.0)
 
 
-# ---- The rule ----
-
-
 @pytest.mark.parametrize(
     ('found', 'uncertainty', 'verdict'),
     [
@@ -252,9 +238,6 @@ def test_the_rule_is_guarded_by_u(
 ) -> None:
     got = verdict_of(np.array(found), np.array(uncertainty), np.ones(3))
     assert (got.found, got.left) == verdict
-
-
-# ---- The page ----
 
 
 def _certified(certificate: Certificate, **changes: Any) -> Certified:
@@ -281,7 +264,6 @@ def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> No
         expanded = [scale * v for scale, v in zip(SCALES, message.uncertainty.tolist(), strict=True)]
         assert [float(v) for v in row[16:19]] == pytest.approx(expanded, abs=6e-4)
         assert tuple(row[19:]) == tuple(verdicts[n])
-    # Nothing is judged without limits.
     assert [row[: len(head) - 2] for row in rows] == _certified(certificate).result_rows()
     assert _certified(certificate).verdicts == []
 
@@ -367,13 +349,9 @@ def test_the_page_has_every_section(certificate: Certificate) -> None:
         f'<td>{certificate.inputs[0].coefficients[0, 0]:.6g}</td>',
     ):
         assert words in page, words
-    # A field is in the page once if it was filled in.
     assert page.count('A-17') == 1
     assert 'No limits were given: nothing is judged.' in _certified(certificate).report()
     assert page.count('<td>. . .') == 13 + 5 + 3 - 3
-
-
-# ---- The folder of a calibration ----
 
 
 def _folder(path: Path, tree: object) -> Path:
@@ -387,7 +365,6 @@ def test_a_folder_is_read_whole(tmp_path: Path) -> None:
     del tree['provenance']['date']
     rig, found = read_calibration(_folder(tmp_path, tree))
     assert rig.heights.tolist() == [0.02, 0.0]
-    # Older ones have no date.
     assert found == {**_tree(), 'provenance': {**_tree()['provenance'], 'date': ''}}
     assert read_calibration(_folder(tmp_path, _tree()))[1] == _tree()
 

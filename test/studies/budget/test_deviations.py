@@ -72,9 +72,6 @@ def _term(name: str) -> Term:
     return found
 
 
-# ---- Deviations ----
-
-
 def _index(kelvin: float, metres: float) -> float:
     """Refractivity of dry air at 1013.25 hPa with 450 ppm of CO2, Birch and Downs 1993 (equations 1 to 3), plus 1."""
     s2 = (1.0 / (metres * 1e6)) ** 2
@@ -170,9 +167,6 @@ def test_what_the_other_terms_change() -> None:
     assert spot.ravel() == pytest.approx([0.0, _diameter(0.7)])
 
 
-# ---- The chain ----
-
-
 def _traced(chain: MeasuringChain, pose: FloatArray, dz: float, psd: int) -> FloatArray:
     """The dot (2,) of one sensor: a ray and a plane in space, with the rotations of scipy."""
     k = chain.slope_ratio[0] / chain.link_length
@@ -240,9 +234,6 @@ def test_only_a_spot_that_has_a_size_is_clipped() -> None:
     assert read[0, 1] == pytest.approx(rig.zeros[1], abs=1e-9)
 
 
-# ---- The estimators ----
-
-
 @pytest.mark.parametrize('method', ['exact', 'beam'])
 def test_weighted_least_squares_is_that_of_scipy(method: str) -> None:
     estimator = estimator_of(RIG, method)
@@ -263,9 +254,6 @@ def test_weighted_least_squares_is_that_of_scipy(method: str) -> None:
 
             best = least_squares(away, np.zeros(3), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale=[1e-3, 1e-3, 1e-2])
             assert pose == pytest.approx(best.x, abs=1e-8)
-
-
-# ---- The situation ----
 
 
 @pytest.mark.parametrize(
@@ -307,9 +295,6 @@ def test_draws_are_of_all_causes_together() -> None:
     got = monte_carlo(at, 25_000, 5, both)
     assert got.bias == pytest.approx(errors.mean(axis=0), rel=1e-9)
     assert got.covariance == pytest.approx((errors - got.bias).T @ (errors - got.bias) / 24_999, rel=1e-9)
-
-
-# ---- The stop rule ----
 
 
 def test_a_window_must_hold_half_a_step() -> None:

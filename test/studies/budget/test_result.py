@@ -85,7 +85,6 @@ def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain:
 def test_without_a_spread_there_is_no_difference() -> None:
     message = expanded(np.array([[4.0, 4.0, 0.0]]), [math.inf], np.zeros(3))
     got = difference(message, Interval(np.array([2.0 * 1.959964, 0.0, 0.0]), np.zeros(3)))
-    # The first is what was drawn; of the others nothing was drawn.
     assert got == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
     assert difference(message, Interval(np.array([1.959964] * 3), np.zeros(3)))[:2] == pytest.approx(
         [1.0, 1.0], abs=1e-6
@@ -216,7 +215,6 @@ def test_u_is_half_of_the_drawn_interval() -> None:
     assert answer.interval is not None
     message = answer.budget.expanded()
     assert np.abs(difference(message, answer.interval)).max() < 0.06
-    # And the interval has 95 % of the draws, counted.
     errors = draws(answer.budget.at, 20_000, 1, shaped=True)
     inside = np.abs(errors - answer.interval.middle) <= answer.interval.half
     assert inside.mean(axis=0) == pytest.approx(0.95, abs=1e-4)

@@ -42,9 +42,6 @@ def _at_pose(pose: FloatArray, method: str = 'exact', rig: Rig = RIG) -> Situati
     return replace(_at((0.0, 0.0, 0.0), method, rig), pose=pose)
 
 
-# ---- The list ----
-
-
 def test_every_row_of_table_3_1_is_there() -> None:
     table = {'E_LP', 'E_DC', 'E_R', 'E_TH', 'E_RF', 'E_EMF', 'E_Algn', 'E_Tilt', 'E_C'}
     assert table <= {c.row for c in CAUSES}
@@ -55,7 +52,6 @@ def test_every_row_of_table_3_1_is_there() -> None:
 def test_terms_name_known_inputs_and_inputs_are_used() -> None:
     declared = {i.parameter.name for i in INPUTS}
     used = {name for c in CAUSES for name in c.inputs}
-    # How well deviations are known serves every term's degrees of freedom.
     assert used | {'noise_freedom', 'assumption_doubt'} == declared
     assert all(c.formula for c in CAUSES)
     assert all(i.source for i in INPUTS)
@@ -69,8 +65,6 @@ def test_an_input_that_is_named_has_an_effect(cause: Cause) -> None:
         after = cause.contribution(_at(**{name: 1.1 * default})).rms
         assert np.any(np.abs(after / before - 1.0) > 1e-6), name
 
-
-# ---- First order and Monte Carlo ----
 
 DRAWS = 10_000
 # Four standard errors of a deviation from that many normal draws, and 1 % for what is beyond second order.
@@ -110,9 +104,6 @@ def test_the_total_agrees_with_drawing_everything_at_once(method: str) -> None:
     assert drawn == pytest.approx(correlation, abs=4.0 / math.sqrt(DRAWS) + 0.01)
 
 
-# ---- Closed forms ----
-
-
 def test_noise_of_the_tied_method_is_the_golden_covariance() -> None:
     # Golden case G5 at 2 um a channel.
     rig = replace_values(RIG, {'amplifier.noise': 4e-3 * math.sqrt(20.0)})
@@ -128,9 +119,6 @@ def test_the_tilt_left_out_is_the_golden_difference() -> None:
     expected = np.array(CASES['G5']['procrustes']) - pose
     assert PLANE_TILT.contribution(_at_pose(pose)).bias == pytest.approx(expected, rel=2e-3)
     assert np.all(PLANE_TILT.contribution(_at_pose(pose, 'beam')).bias == 0.0)
-
-
-# ---- E_C ----
 
 
 @pytest.mark.parametrize('name', ['G3', 'G4', 'G6', 'G9', 'G10'])
@@ -149,9 +137,6 @@ def test_the_stop_rule_is_short_by_its_window(name: str) -> None:
     assert math.sqrt(12.0 * got.covariance[2, 2]) == pytest.approx(step, rel=1e-6)
     # The thesis takes d from PSD 1: so wrong an angle swings it by the arm.
     assert stopped[:2] / stopped[2] == pytest.approx(got.bias[:2] / got.bias[2], rel=0.02, abs=1e-3)
-
-
-# ---- Where the budget cannot be drawn up ----
 
 
 def test_shares_add_to_one_where_one_bias_stands_alone() -> None:

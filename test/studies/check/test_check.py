@@ -166,7 +166,6 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     found = checked(volts, loads)
     assert [(f.name, f.where) for f in found.findings] == [('stuck_channel', channel)]
     assert not found.values
-    # On the page each is a sentence, on the terminal a row.
     (reported,) = [text for text in found.sentences() if text.startswith(channel)]
     assert re.fullmatch(rf'{channel}: [^:]+: .+', reported)
     assert '  ' not in reported
@@ -228,9 +227,6 @@ def test_uninformative_loads_or_gaps_cannot_tell() -> None:
     assert checked(lost, loads).verdict == RIGHT
     with pytest.raises(RecordingError, match='at least 8 are needed'):
         checked(volts[:100], loads[:100])
-
-
-# ---- the command
 
 
 def written(path: Path, volts: FloatArray, loads: FloatArray) -> Path:
@@ -327,6 +323,5 @@ def test_removed_weight_moves_dots_by_what_it_held(tmp_path: Path, capsys: pytes
     assert main(['simulate', '--out', made, '--loads', SWAYS[2]]) == 0
     observed = read_observation(made, rig)
     (push,) = responses(rig, observed.volts, observed.loads).pushes
-    # Named by the load upwards; what hung there pulled down.
     assert push.channels == pytest.approx(before - after, abs=1e-6)
     assert push.expected == pytest.approx(before - after, abs=1e-9)

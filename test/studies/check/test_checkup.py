@@ -65,9 +65,6 @@ def of(found: Checkup) -> list[tuple[str, str]]:
     return [(f.name, f.where) for f in found.findings]
 
 
-# ---- which channel does not answer
-
-
 def test_channel_below_a_tenth_of_every_push_is_dead() -> None:
     def with_share(share: float, only_twist: bool = False) -> Checkup:
         fx = replace(push('fx'), channels=np.array([share, 0.0, math.sqrt(1.0 - share**2), 0.0]) * -1e-4)
@@ -96,9 +93,6 @@ def test_stuck_channel_is_reported_once_without_wiring() -> None:
     rotated = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push(load, 9.80665, rotated) for load in ('fx', 'fy', 'tz')]
     assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
-
-
-# ---- wirings
 
 
 def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
@@ -149,9 +143,6 @@ def test_a_load_of_the_other_sign_is_reported() -> None:
     assert found.sizes == pytest.approx([1.0, 1.0, -1.0])
 
 
-# ---- sizes
-
-
 @pytest.mark.parametrize(
     ('size', 'reported'),
     [
@@ -174,9 +165,6 @@ def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
     assert found.notes == ((words,) if reported else ())
     # By hand nobody knows how far.
     assert checked([push('fx'), push('fy'), push('tz', size, sized=False)]).notes == ()
-
-
-# ---- what is needed
 
 
 @pytest.mark.parametrize(
@@ -221,9 +209,6 @@ def test_pushes_that_no_wiring_explains_are_asked_for_again() -> None:
     # Of a wrong wiring several are left: that is wrong, and more is asked for too.
     wiring = Wiring(False, (('-x', 'y'), ('x', 'y')))
     assert of(checked([push('fx', 1.0, wiring), push('fy', 1.0, wiring)]))[-1] == ('load_coverage', 'tz')
-
-
-# ---- levels
 
 
 def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:

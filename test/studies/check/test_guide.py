@@ -92,8 +92,6 @@ def test_a_turn_the_other_way_is_reported_beside_exchanged_psds() -> None:
     assert found.findings[0].equivalent == ('load_sign of tz',)
 
 
-# ---- the phases, sample by sample
-
 MICRO = 1e-6
 WAIT = 500
 """Blocks of ten seconds."""

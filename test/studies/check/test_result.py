@@ -156,9 +156,7 @@ def test_push_rows_list_expected_channels_of_rig_file() -> None:
     # Rounded to a tenth of a micrometre.
     near = replace(PUSHES[0], channels=np.array([1.0499995e-6, 1.0500005e-6, 0.0, 0.0]))
     assert push_rows(replace(CHECKUP, pushes=(near,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
-    # One push that has a size is enough for a column.
     assert [row[-1] for row in push_rows(replace(CHECKUP, pushes=PUSHES[::-1]))] == ['size', '1.50', '']
-    # A push that was not seen has none either, and then there is no column.
     assert [len(row) for row in push_rows(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
     assert CHECKUP.lines()[1].split() == [

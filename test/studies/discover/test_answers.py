@@ -54,9 +54,6 @@ def workspace() -> Workspace:
     return Workspace([make_observation(), make_observation(1, name='second', warm=None)])
 
 
-# Mistakes of the set-up.
-
-
 def of_setup(name: str) -> Effect:
     listed = mistakes(2, [0.04, -0.02], [(1, 2, 0.5)])
     return next(e for e in listed if e.name == name)
@@ -208,9 +205,6 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     assert likely_jumps(fake, 0.35 * part) == []
 
 
-# Signatures.
-
-
 def declared(*parameters: EffectParameter, **given: Any) -> Effect:
     full = {'name': 'made_up', 'stage': 'psd', 'point': 'dots', 'apply': lambda *_: None}
     return Effect(summary='', equation='', source='', needs='', parameters=parameters, **{**full, **given})
@@ -298,9 +292,6 @@ def test_a_signature_is_the_change_by_one_probe() -> None:
     assert column[0, 0] == pytest.approx(0.75)
 
 
-# Proposals.
-
-
 def test_lines_come_strongest_first_each_once() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(4096) * 1e-3
@@ -351,9 +342,6 @@ def test_a_step_is_coarse_from_three_counts_on(counts: int, observed: bool) -> N
     assert proposals.coarse_step(dataclasses.replace(o, volts=np.sign(o.volts) * counts * lsb)) is None
 
 
-# The search's small rules.
-
-
 def test_the_best_of_each_variant_is_tried() -> None:
     def score(name: str, gain: float, dof: int = 1) -> Any:
         return SimpleNamespace(gain=gain, dof=dof, candidate=SimpleNamespace(variant=(name,)))
@@ -370,9 +358,6 @@ def test_the_best_of_each_variant_is_tried() -> None:
     assert len(promising(scores, 3.0, 0.3, 2)) == 2
     assert promising([score('a', 0.0)], 3.0, 0.0, 9) == []
     assert promising([], 3.0, 0.3, 9) == []
-
-
-# Plans.
 
 
 def reported_of(alternative: str, separation: float, reverse: float, possible: float) -> Discrimination:
@@ -449,9 +434,6 @@ def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
     assert len(planning.best_combination(poor, shows(0.0, 0.0), lambda s: s.apart[0], 9.0)[1]) == 1
 
 
-# What is said.
-
-
 def micrometres(value: float) -> str:
     return f'{1e6 * value:.3g} µm'
 
@@ -511,9 +493,6 @@ def test_a_gap_that_remains_is_never_left_unreported() -> None:
     assert u.unexplained
 
 
-# The files.
-
-
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
     full = {
         'sd': {},
@@ -535,8 +514,6 @@ def test_numbers_of_json_are_finite() -> None:
     assert trees.parameters_of(rotated) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
     assert nested({'a.b': (1, 2), 'a.c.d': 'x', 'e': 3}) == {'a': {'b': [1, 2], 'c': {'d': 'x'}}, 'e': 3}
 
-
-# A whole discovery of few effects.
 
 FEW = ('sensor_rotation', 'sensor_gain', 'bending_stiffness')
 HIDDEN = {'psd': 2, 'angle': 0.03}
@@ -582,7 +559,6 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
     assert (found.verdict, found.unknown, found.setup, found.law, found.values) == ('effects_found', (), (), None, {})
     assert (found.seed, found.known, found.alternative_fits, found.unsettled) == (0, (), (), ())
     assert found.active_effects == [named.active]
-    # One picture, whose length is the deviation: of the turn about the centre of the PSD.
     h = 1e-4
     plus = ActiveEffect(named.active.effect, {**named.active.values, 'angle': named.active.values['angle'] + h})
     slope = (

@@ -120,9 +120,6 @@ def test_a_parameter_stays_where_the_rig_lets_it() -> None:
     assert fit.effects[0].values['x'] <= 0.5 * RIG.psds[1].active_area[0]
 
 
-# Pieces.
-
-
 @pytest.mark.slow
 def test_directions_that_cannot_be_observed_are_left_alone() -> None:
     fisher = np.array([[1.0, 1.0], [1.0, 1.0]])
@@ -130,9 +127,6 @@ def test_directions_that_cannot_be_observed_are_left_alone() -> None:
     assert rank == 1
     assert gain == pytest.approx(4.0)
     np.testing.assert_allclose(c, [1.0, 1.0])
-
-
-# The commands.
 
 
 def simulate(tmp_path: Path, *words: str) -> Path:
@@ -190,7 +184,6 @@ def test_a_bag_reports_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsy
     assert main(['discover', str(tmp_path / 'run'), '--out', str(tmp_path / 'found'), '--quiet']) == 0
     assert 'sensor_rotation (psd 1) is missing' in capsys.readouterr().out
     assert load_rig(tmp_path / 'found' / 'model.yaml').link.length == 0.4
-    # The front door says the same; and the model it left, nothing missing.
     found = psd_deflection.discover([tmp_path / 'run'], tmp_path / 'found' / 'model.yaml')
     assert found.verdict == 'nothing_missing'
 

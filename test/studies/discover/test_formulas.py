@@ -51,9 +51,6 @@ def workspace() -> Workspace:
     return Workspace([make_observation(), make_observation(1, name='second', warm=None)])
 
 
-# What a rig can be asked to do.
-
-
 def script(levels: list[tuple[float, float, float]], dwell: float) -> tuple[str, ...]:
     """Steps in the notation of ``simulate --loads``, three decimals."""
 
@@ -139,7 +136,6 @@ def test_settings_are_lengths_rates_and_temperatures() -> None:
         ('on a link of 0.90 m', {'link.length': 0.9}, 0.0),
         ('at 500 samples/s', {'converter.sample_rate_hz': 500.0}, 0.0),
     ]
-    # Nothing is easier than the rig as it is; a link is hardest to exchange.
     assert [s.effort for s in got] == [0.0, 0.03, 0.05, 0.05, 0.02]
     assert settings(RIG, Limits(swing=0.0))[1].changes == {'link.length': 0.409 if RIG.link.length == 0.585 else None}
     assert got[0].knots == [20.0]
@@ -181,7 +177,6 @@ def test_separation_is_residual_of_both_recordings() -> None:
     target = np.concatenate((rows[0] - rows[1], np.zeros(15)))
     residual = target - both @ np.linalg.lstsq(both, target, rcond=None)[0]
     assert observed.separation(0, 1, old.T @ old) == pytest.approx(float(residual @ residual), rel=1e-9)
-    # One without parameters cannot adapt.
     assert observed.separation(1, 0, np.zeros((0, 0))) == pytest.approx(observed.apart[0, 1])
     again, _, _ = some_shown(rng, 3.0)
     total = observed + again * 2.0
@@ -196,9 +191,6 @@ def test_separation_is_residual_of_both_recordings() -> None:
         np.testing.assert_array_equal(a.apart, b.apart)
         np.testing.assert_array_equal(a.fisher[1], b.fisher[1])
         np.testing.assert_array_equal(a.pull[0][1], b.pull[0][1])
-
-
-# Where, and on what it depends.
 
 
 def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
@@ -228,7 +220,6 @@ def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
 def test_folds_are_dealt_out_in_turn(workspace: Workspace) -> None:
     cases = max(int(c.max()) for c in workspace.case) + 1
     assert workspace.folds().tolist() == [i % 4 for i in range(cases)]
-    # The second recording's cases are others than the first one's.
     assert workspace.case[1].min() == workspace.case[0].max() + 1
     one = Workspace([make_observation(history=np.zeros((400, 3)), warm=None)])
     assert one.folds().tolist() == [0, 1, 2, 3]
@@ -275,9 +266,6 @@ def test_a_recording_knows_its_length_and_its_digest() -> None:
     ):
         assert other.hashed() != o.hashed()
     assert dataclasses.replace(o, name='other').hashed() == o.hashed()
-
-
-# Noise.
 
 
 def test_whitening_predicts_each_block_from_those_before_it() -> None:
@@ -332,14 +320,10 @@ def test_of_many_lines_the_strongest_four_are_stripped() -> None:
     spectrum = np.abs(np.fft.rfft(strip_lines(noise + lines[0], 1)))
     assert spectrum[[*range(1, 197), *range(204, 2000)]].min() > 1e-6
     assert spectrum[197:204].max() < 1e-9
-    # A channel that reads 0 has none.
     assert not strip_lines(np.zeros(1000)).any()
     # The fifth, 5 sin, stays: variance 12.5 more.
     assert strip_lines(noise + sum(lines)).var() == pytest.approx(1.0 + 12.5, rel=0.1)
     assert strip_lines(noise + sum(lines), 5).std() == pytest.approx(1.0, abs=0.05)
-
-
-# What of a recording is no measurement.
 
 
 @pytest.mark.parametrize(('count', 'is_stuck'), [(29, False), (30, True)])

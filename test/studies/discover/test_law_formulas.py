@@ -209,9 +209,6 @@ def test_between_two_loads_any_level_is_as_good(observed: tuple[Workspace, Fit])
     assert f'> ({0.5 * (low + high):.4g} ± ' in law.expression
 
 
-# Laws and their fits.
-
-
 def test_fitted_law_has_fit_numbers_and_deviations() -> None:
     law = Law(
         'law_y2', 'psd', 'y2', (LawTerm('above', ('load_fy',), shapes={'threshold': 4.0}), LawTerm('product', ('dx',)))
@@ -381,9 +378,6 @@ def test_a_law_shows_where_a_twentieth_of_its_energy_is(observed: tuple[Workspac
         effects = tuple(ActiveEffect(effect_of(law), values_of(law)) for law in (big, small))
         fit = refit(workspace, effects, 0)
         assert laws.dominant_channels(workspace, laws.LawTrial((big, small), fit, 0.0)) == shown
-
-
-# The search for a law, with costs that are given.
 
 
 class Given(laws.LawSearch):

@@ -88,13 +88,11 @@ def test_law_is_adopted_and_explains_recording(tmp_path: Path, monkeypatch: pyte
     assert law['channels'] == ['y2']
     assert law['heldout_after'] < 1.05 * reported['gap']['floor']
     assert 'A law for it' in (out / 'report.html').read_text()
-    # It is an effect of the user's now, and the model has it.
     assert 'yielding' in effect_names()
     adopted = read_law(ours / 'yielding.yaml')
     assert adopted.terms[0].coefficient == pytest.approx(3e-9, rel=0.05)
     (active,) = effects_of_rig(load_rig(out / 'model.yaml'))
     assert active.effect.name == 'yielding'
-    # A name that is taken, and one that is none, are rejected before the search.
     assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet']) == 2
     assert main(['discover', run, '--out', str(out), '--adopt', 'a b', '--quiet']) == 2
 

@@ -34,8 +34,6 @@ from psd_deflection.studies.discover.setup import setup
 from .test_formulas import RIG, make_observation
 from .test_rules import A, Plant, active, noise, pictures
 
-# Wiring and units.
-
 
 def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """It pulled the other way, half as much as annotated: that is no unit, but the sign is wrong."""
@@ -47,12 +45,6 @@ def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch
     assert lines == {}
 
 
-# Starting values.
-
-
-# Candidates.
-
-
 @pytest.mark.parametrize(('main', 'coupled'), [(1e-6, 0.0), (1.01e-6, 0.5), (-1e-6, 0.0), (-1.01e-6, -0.5)])
 def test_what_is_coupled_to_nothing_is_none(main: float, coupled: float) -> None:
     size = EffectParameter('size', 'V', -1.0, 1.0, 1.0, '')
@@ -61,12 +53,6 @@ def test_what_is_coupled_to_nothing_is_none(main: float, coupled: float) -> None
     off = {'size': 0.0, 'with_it': 0.0}
     found = Candidate(effect, off, ('size', 'with_it'), off).from_coefficients(np.array([main, 0.5 * 1.01e-6]))
     assert found.values['with_it'] == pytest.approx(coupled)
-
-
-# Plans.
-
-
-# Laws.
 
 
 def test_noise_of_a_sum_is_no_gap() -> None:
@@ -103,12 +89,6 @@ def test_where_a_block_is_lost_a_law_is_not_looked_for() -> None:
     assert np.isfinite(r.error).all()
 
 
-# The screen.
-
-
-# Wiring, jumps and places.
-
-
 def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     o = make_observation(warm=None)
     file = Wiring.from_rig(o.rig)
@@ -124,9 +104,6 @@ def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyP
     _, (wiring, sign), _ = setup.correct_wiring([o], ())
     assert (sign.name, sign.where) == ('load_sign', 'tz')
     assert all(words.endswith(' and load_sign of tz') for words in wiring.equivalent)
-
-
-# The words of the answer.
 
 
 def test_what_a_law_leaves_is_reported_in_micrometres() -> None:

@@ -46,9 +46,6 @@ from .test_rules import FINE, A, B, Lone, Plant, candidate, noise, nowhere, pict
 DOTS = [0, 1, 3, 4]
 
 
-# What of a recording is no measurement.
-
-
 @pytest.mark.parametrize('there', [7, 8])
 def test_of_eight_samples_one_may_be_an_outlier(there: int) -> None:
     x = np.full((40, 1), np.nan)
@@ -76,9 +73,6 @@ def test_what_is_stuck_is_reported_with_its_place_and_share() -> None:
     step = 64 * RIG.converter.volts_per_count
     coarse = dataclasses.replace(o, volts=np.rint(o.volts / step) * step)
     assert cleaning.clean(coarse, ())[1] == []
-
-
-# The workspace.
 
 
 @pytest.fixture(scope='module')
@@ -198,9 +192,6 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     assert ws.with_free((ZeroDirection(0, 1, 1e-6),)).refitted_beside(off, ()).observations[0] is o
 
 
-# Noise.
-
-
 def resting(n: int, level: float, memory: float = 0.0, seed: int = 0) -> FloatArray:
     e = level * np.random.default_rng(seed).standard_normal((n, 6))
     for i in range(1, n):
@@ -240,9 +231,6 @@ def test_a_memory_of_noise_is_that_of_its_process() -> None:
     assert estimate_noise(o, rows, 4, floor).coloured == (False,) * 6
 
 
-# Starting values.
-
-
 def test_a_line_persists_though_most_of_a_quarter_was_left_out() -> None:
     """As the time in which a weight swayed: what is not there is 0."""
     hum = np.sin(2 * np.pi * 50.0 * 1e-3 * np.arange(4000.0))[:, None]
@@ -255,30 +243,6 @@ def test_a_line_persists_though_most_of_a_quarter_was_left_out() -> None:
     rows = hum.copy()
     rows[:1000] = 0.01
     assert proposals.persistent([50.0], [rows], [np.ones(1)], [1e-3]) == []
-
-
-# What the set-up may be wrong by.
-
-
-# Signatures.
-
-
-# Held-out load cases.
-
-
-# The verdict.
-
-
-# Where.
-
-
-# Plans.
-
-
-# Coarse steps.
-
-
-# Noise that grows.
 
 
 def test_wild_values_count_as_six_deviations() -> None:

@@ -425,9 +425,6 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     assert (found.excess, found.p) == (found.dependences[0].gain, found.dependences[0].p)
 
 
-# Whole answers.
-
-
 def steel(size: float, seed: int = 0, **given: Any) -> Pictures:
     """Two pictures, of which the second has ``size``, in noise of 0.02; a third is the nuisance's, of size 1.5."""
     rng = np.random.default_rng(seed)

@@ -106,7 +106,6 @@ def test_what_depends_on_time_or_on_the_row_before_takes_no_part() -> None:
         names
     )
     assert {'bending_stiffness', 'sensor_gain', 'tip_force', 'thermal_drift'} <= set(names)
-    # Whether the mode moves with the stiffness makes no difference at rest.
     assert len(list(names['bending_stiffness'].variants())) == 1
 
 

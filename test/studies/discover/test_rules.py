@@ -185,8 +185,6 @@ def result_of(search: Search, effects: Sequence[ActiveEffect], others: Sequence[
     return SearchResult(null, fit, p, bic, gains, alternatives=[list(o) for o in others])
 
 
-# Fits.
-
 A, B = ('a', 'x'), ('b', 'x')
 
 
@@ -314,9 +312,6 @@ def test_a_fit_that_is_far_off_is_tried_from_elsewhere(starts: tuple[float, ...]
     best = search.best_of([[start]], 1, 30)
     assert best is not None
     assert best.effects[0].values['x'] == pytest.approx(found, abs=0.01)
-
-
-# The rules by which an effect is named.
 
 
 @pytest.mark.parametrize(
@@ -476,9 +471,6 @@ def test_weak_effects_are_dropped_before_alternatives(remains: float, kept: list
     assert sorted(a.effect.name for a in result.fit.effects) == kept
 
 
-# Load cases that a fit has not seen.
-
-
 def test_held_out_residual_is_of_fit_without_its_cases() -> None:
     shown = pictures(A, B)
     plant = Plant(shown, 1e-4 * shown[A] - 1e-4 * shown[B] + noise())
@@ -525,9 +517,6 @@ def test_the_error_of_an_unseen_gain_is_the_smaller_of_two() -> None:
     assert gain.significant
     assert not HeldOut(2.0, 1.0).significant
     assert HeldOut(2.1, 1.0).significant
-
-
-# The screen.
 
 
 def candidate(name: str, *parameters: str, least: float = -1.0) -> Candidate:
@@ -618,9 +607,6 @@ def test_sizes_come_from_coefficients_of_pictures() -> None:
     assert values == pytest.approx({'x': 0.5, 'angle': math.atan2(4.0, 3.0)})
 
 
-# Sizes that are tied.
-
-
 @pytest.mark.parametrize(('ratio', 'tied'), [(1.0, True), (1.02, True), (1.1, False), (2.0, False), (-1.0, True)])
 def test_two_sizes_are_tied_if_their_ratio_is_one_within_the_fit(ratio: float, tied: bool) -> None:
     shown = pictures(A, B)
@@ -639,9 +625,6 @@ def test_two_sizes_are_tied_if_their_ratio_is_one_within_the_fit(ratio: float, t
         density = math.exp(-0.5 * (math.log(abs(a / b)) / deviation) ** 2) / (deviation * math.sqrt(2.0 * math.pi))
         assert got[0].odds == pytest.approx(density * 2.0 * math.log(10.0), rel=1e-6)
         assert (got[0].members, got[0].unit) == (((0, 'x'), (1, 'x')), 'V')
-
-
-# Where, and what it depends on.
 
 
 def nowhere(**changes: Any) -> Localisation:
@@ -760,12 +743,6 @@ def test_dependence_is_chi_square_of_regressor() -> None:
     assert best.p == pytest.approx(1.0 - (1.0 - chi2_law.sf(best.gain, 1)) ** count, rel=0.05)
 
 
-# Noise.
-
-
-# Workspace.
-
-
 def test_counts_gaps_and_floor_of_a_workspace() -> None:
     volts = 2e-3 * np.random.default_rng(0).standard_normal((2000, 6))
     volts[[3, 99, 1001]] = np.nan
@@ -801,9 +778,6 @@ def test_noise_of_recording_with_gaps_equals_full_one(share: float) -> None:
     model = estimate_noise(Observation('gaps', RIG, volts, loads_of), volts, 4, np.full(6, 5e-4))
     assert model.sigma == pytest.approx(np.full(6, 2e-3), rel=0.08)
     assert not any(model.coloured)
-
-
-# The experiment that decides.
 
 
 def test_experiment_separates_what_no_size_explains(monkeypatch: pytest.MonkeyPatch) -> None:

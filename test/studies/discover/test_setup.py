@@ -170,9 +170,6 @@ def test_a_jump_is_found_at_its_sample() -> None:
     assert likely_delays(workspace) == []
 
 
-# What is no measurement.
-
-
 @pytest.mark.parametrize('share', [0.001, 0.05])
 def test_outliers_are_excluded_and_movement_is_kept(share: float) -> None:
     o = recorded()
@@ -225,6 +222,5 @@ def test_command_prints_lines_and_puts_them_in_model(tmp_path: Path, capsys: pyt
     tree = json.loads((out / 'result.json').read_text())
     assert tree['verdict'] == 'nothing_missing'
     assert [s['name'] for s in tree['setup']] == ['sample_rate', 'channel_sign']
-    # With the model nothing is wrong any more.
     assert clean(read_observation(path, model), ())[1] == []
     assert correct_wiring([read_observation(path, model)], ())[1] == []

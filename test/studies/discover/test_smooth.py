@@ -282,9 +282,6 @@ def test_the_zero_of_a_run_left_out_is_not_known(zeros: PlantDiscovery) -> None:
     assert zeros.gap_heldout_after == pytest.approx(zeros.gap_before, rel=0.01)
 
 
-# The pieces, by counting all subsets and by least squares of numpy.
-
-
 def all_subsets(f: FloatArray, g: FloatArray, energy: float, size: float) -> tuple[FloatArray, FloatArray]:
     """Mean sizes of the terms, and how likely each takes part, over all subsets and precisions of the sizes."""
     count = len(g)

@@ -165,7 +165,6 @@ def test_stand_in_effect_is_reported_and_not_added() -> None:
     (limit,) = found.limits
     assert limit.limit.startswith('b beside 1 effect explains less than 20% of what remains')
     assert limit.beyond.startswith('1 more term (b) would pass')
-    # With it nothing is left that stands in for anything.
     full = ran(searching(plant, shown, 'abc'))
     assert (named(full.fit), full.limits) == (['a', 'b', 'c'], ())
 

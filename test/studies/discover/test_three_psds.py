@@ -96,9 +96,6 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
         with_effects(TWO, ['mains_interference,amplitude_x3=0.01'], 'test')
 
 
-# Wirings.
-
-
 @pytest.mark.slow
 def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
     """No parameter says it, so there is no line for it."""
@@ -152,9 +149,6 @@ def test_what_is_wired_otherwise_is_reported_of_any_psd() -> None:
     lines = parameters(wired, file)
     assert lines == {'psds_exchanged': True, 'psd_4.axes': ['-y', 'x']}
     assert [fix_of(d, wired, lines) for d in wrong] == ['psds_exchanged: true', *['psd_4.axes: [-y, x]'] * 2]
-
-
-# Redundant readings.
 
 
 @pytest.mark.parametrize(('rig', 'count'), [(TWO, 1), (RIG, 3), (SIX, 9)])
@@ -217,9 +211,6 @@ def test_redundant_readings_acquit_detectors(word: str, acquitted: bool) -> None
     reading = fourth_reading(ws, residual)
     assert reading.values == 3 * ws.measured[0].shape[1]
     assert reading.acquits == acquitted
-
-
-# Files.
 
 
 def test_recordings_of_one_search_are_of_as_many_psds() -> None:

@@ -81,9 +81,6 @@ def test_ordinals_end_as_their_last_word() -> None:
     assert [ordinal(n) for n in range(1, 1001)] == [f'{n}{ending(n)}' for n in range(1, 1001)]
 
 
-# ---- steps of the dots
-
-
 def stepped(n: int, steps: dict[int, float], noise: float = 0.0, seed: int = 0) -> FloatArray:
     """Dots (n, 4) whose x1 steps by so much at so many samples."""
     dots = noise * np.random.default_rng(seed).normal(size=(n, 4))
@@ -137,9 +134,6 @@ def test_a_step_agrees_with_a_sample_by_sample_account(width: int, lost: float, 
     assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
 
 
-# ---- which note belongs to which step
-
-
 def as_steps(*places: tuple[float, float]) -> list[steps_module.DotStep]:
     return [steps_module.DotStep(at, size, round(at) - 5, round(at) + 5) for at, size in places]
 
@@ -188,9 +182,6 @@ def test_a_note_on_time_like_half_of_the_others_stays() -> None:
     # If the others are late, that one is at a step by chance.
     late = np.array([1400, 3600, 5000])
     assert annotated_times.matched_notes(late, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 2)]
-
-
-# ---- loads between samples
 
 
 def test_step_keeps_its_time_and_ramp_its_share() -> None:
@@ -324,9 +315,6 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
     assert found == pytest.approx((1003.0, 0.0), abs=3e-4)
 
 
-# ---- what is left
-
-
 def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     loads, count = np.zeros((6000, 3)), 6000
     quiet = np.repeat(np.random.default_rng(1).normal(size=(300, 4)), 20, axis=0)
@@ -340,15 +328,11 @@ def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     assert found.notes == (sudden, rough)
     ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
     assert np.flatnonzero(found.unused).tolist() == list(range(1980, math.floor(1000.0 * ends) + 1))
-    # While it was applied it counts as nothing.
     rest = quiet.copy()
     rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
     rest[2500:2520] = 1000.0
     found = annotated_times.without_rough_motion(RIG, loads, [slow], rest)
     assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
-
-
-# ---- all of it, with what it is made of told
 
 
 def with_pieces(
@@ -449,7 +433,6 @@ def test_plate_motion_needs_every_reading() -> None:
     assert moved_plate(PLATE_RIG, volts, there) == pytest.approx(poses, abs=1e-12)
     there[[0, 4], [0, 2]] = 0.0
     there[1, 1] = 0.05
-    # Without a sum the dots are still known.
     there[5, 3] = 0.0
     lost = np.where([True, False, True, False], np.nan, poses)
     assert moved_plate(PLATE_RIG, volts, there) == pytest.approx(lost, abs=1e-12, nan_ok=True)

@@ -325,9 +325,7 @@ def test_noise_correlation_is_below_four_over_root_n(count: int, memory: float, 
     assert len(measured) == noise
     if noise:
         assert loads[:, 1] == pytest.approx(np.full(2 * count, values.mean()))
-    # Whatever its unit.
     assert len(measured_along_y(1e-3 * values)[1]) == noise
-    # And so it is of the part after a step.
     first = with_memory(count, 0.0)
     assert len(measured_along_y(np.concatenate((first, 1000.0 + values)))[1]) == 1 + noise
     # That along Y says all, whatever the others do.

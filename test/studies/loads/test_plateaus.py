@@ -177,9 +177,6 @@ def test_a_step_without_a_note_has_its_time() -> None:
     assert correct_loads(RIG, dots, annotated_as(2, (0, -20, 0))) is None
 
 
-# ---- the pieces, by hand
-
-
 def reported(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
     return [(p.first, p.last, p.number, p.unannotated) for p in listed]
 
@@ -276,7 +273,6 @@ def test_a_faulty_detector_is_no_wrong_note() -> None:
     # Far beyond the tolerance no plate is asked for.
     far_off = plateaus.outliers(observed({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
-    # Nothing that moves is nothing to explain.
     assert not plateaus.closes(observed({}))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
         assert plateaus.outliers(observed(wrong, left=left), bent).gone == gone
@@ -335,9 +331,6 @@ def test_loads_of_which_none_held_were_not_rounded() -> None:
     assert found.annotated.shape == (0, 3)
     assert not plateaus.may_be_rounded(found)
     assert not plateaus.all_free(found, none)
-
-
-# ---- what is said
 
 
 def world(

@@ -119,9 +119,6 @@ def dense(columns: AnyArray, values: AnyArray, weights: AnyArray) -> tuple[AnyAr
     return np.linalg.solve(normal, columns.T @ (weights * values)), np.linalg.inv(normal)
 
 
-# What is said
-
-
 def test_the_interval_holds_95_percent() -> None:
     assert Offset(0.5, 0.1, 0.0, 0.0, True, (), 100).interval == pytest.approx((0.304, 0.696))
     assert not Offset(0.5, 0.01, 0.0, 0.0, True, (), 100).determined
@@ -158,9 +155,6 @@ def test_the_interval_holds_95_percent() -> None:
 )
 def test_the_sentence_word_for_word(found: Offset, words: str) -> None:
     assert found.sentence == words
-
-
-# Which offset it is
 
 
 def biweight(u: float) -> float:
@@ -241,9 +235,6 @@ def test_without_a_fit_there_is_no_offset(monkeypatch: pytest.MonkeyPatch) -> No
         found_of(monkeypatch, [None, fit_with(0.6, 0.1)], np.zeros((50, 3)))
 
 
-# The first look, on the grid
-
-
 def coarse_by_hand(poses: AnyArray, there: AnyArray, place: AnyArray, reference: AnyArray, reach: int) -> list[int]:
     """Lag by lag, reference by reference: the five lowest minima, five samples apart at least."""
     lags = list(range(-reach, reach + 1))
@@ -310,9 +301,6 @@ def test_offsets_up_to_the_largest_are_tried_and_no_others(sign: int) -> None:
 
     assert first(40) == pytest.approx(0.04 * sign)
     assert first(41) != pytest.approx(0.041 * sign)
-
-
-# The refinement
 
 
 @pytest.mark.parametrize(('outliers', 'still'), [(0, True), (6, False)])
@@ -465,9 +453,6 @@ def test_a_refinement_ends_below_a_tenth_of_a_microsecond(monkeypatch: pytest.Mo
     assert min(steps[2:-1]) >= 1e-7
     # The weights of outliers are those of the second pass, so there are three.
     assert len(steps_of(monkeypatch, 0.0123, 1e-9)) == 3
-
-
-# Scores that follow each other
 
 
 def newey_west(scores: FloatArray) -> float:
