@@ -22,12 +22,7 @@ SHAKER = pytest.StashKey[Shaker]()
 settings.register_profile('untimed', deadline=None)
 # For `make mutants`: it asks only whether a test fails, each time of the same few examples.
 settings.register_profile(
-    'mutants',
-    deadline=None,
-    derandomize=True,
-    database=None,
-    phases=(Phase.explicit, Phase.generate),
-    max_examples=30,
+    'mutants', deadline=None, derandomize=True, database=None, phases=(Phase.explicit, Phase.generate), max_examples=30
 )
 settings.load_profile('mutants' if 'PSD_DEFLECTION_MUTANTS' in os.environ else 'untimed')
 

@@ -18,16 +18,7 @@ import psd_deflection
 PACKAGE = Path(psd_deflection.__file__).parent
 ROOMS = ('run', 'ros', 'devices', 'camera', 'arms', 'measure')
 UNBOUNDED = {
-    'dict',
-    'set',
-    'list',
-    'Counter',
-    'defaultdict',
-    'OrderedDict',
-    'deque',
-    'SimpleQueue',
-    'Queue',
-    'LifoQueue',
+    *('dict', 'set', 'list', 'Counter', 'defaultdict', 'OrderedDict', 'deque', 'SimpleQueue', 'Queue', 'LifoQueue'),
 }
 GROWS = {'append', 'appendleft', 'add', 'setdefault', 'extend', 'update', 'put', 'put_nowait', 'insert'}
 

@@ -225,15 +225,7 @@ def test_every_extra_that_is_asked_for_is_there() -> None:
 
 
 SOURCES = (
-    'psd_deflection',
-    'msg_adapters',
-    'launch',
-    'test',
-    'bench',
-    'blind',
-    'tools',
-    'resource/ros2_run',
-    'setup.py',
+    *('psd_deflection', 'msg_adapters', 'launch', 'test', 'bench', 'blind', 'tools', 'resource/ros2_run', 'setup.py'),
 )
 
 

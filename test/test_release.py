@@ -11,26 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from tools.release import (
-    MAKERS,
-    TREE,
-    main,
-)
+from tools.release import MAKERS, TREE, main
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
 NEEDED = (
-    'package.xml',
-    'setup.cfg',
-    'LICENSE',
-    'CHANGELOG.md',
-    'CITATION.cff',
-    'docs/dependencies.md',
-    '.github',
-    'packaging',
-    'psd_deflection/__init__.py',
-    'psd_deflection/base/page',
+    *('package.xml', 'setup.cfg', 'LICENSE', 'CHANGELOG.md', 'CITATION.cff', 'docs/dependencies.md', '.github'),
+    *('packaging', 'psd_deflection/__init__.py', 'psd_deflection/base/page'),
 )
 
 

@@ -154,24 +154,6 @@ def test_drag_zooms_plots_of_axis_and_button_resets(page: Page) -> None:
     page.until('parseFloat(document.querySelector("output.at[data-plot=c0p0]").textContent) > 90')
 
 
-def test_the_keyboard_moves_the_cursor_and_looks_closer(page: Page) -> None:
-    plot = page.driver.find_element(By.ID, 'plot_c0p0')
-    at = 'parseFloat(document.querySelector("output.at[data-plot=c0p0]").textContent)'
-    plot.send_keys(Keys.ARROW_RIGHT)
-    page.until(f'{at} === 50')
-    plot.send_keys(Keys.ARROW_LEFT, Keys.ARROW_LEFT)
-    page.until(f'{at} === 48')
-    assert values(page)['c0p0 before'] == '96'
-    assert values(page)['c0p1 before'] == '2304'
-    plot.send_keys(Keys.PAGE_DOWN)
-    page.until(f'{at} === 68')
-    plot.send_keys('+')
-    page.until('document.querySelector("button.whole").classList.contains("zoomed")')
-    plot.send_keys('0')
-    page.until('!document.querySelector("button.whole").classList.contains("zoomed")')
-    assert page.js('document.activeElement.id') == 'plot_c0p0'
-
-
 @pytest.mark.slow
 def test_the_charts_are_accessible_and_no_wider_than_a_phone(page: Page) -> None:
     page.js('document.querySelector("details").setAttribute("open", "")')

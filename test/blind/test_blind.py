@@ -9,14 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import generator, run, score
-from blind.cases import (
-    DRAWS,
-    EFFECTS,
-    NOISES,
-    Case,
-    designs,
-    short_cases,
-)
+from blind.cases import DRAWS, EFFECTS, NOISES, Case, designs, short_cases
 from blind.generator import LINK
 from psd_deflection.model.simulation.catalogue import make_active, sort_effects
 from psd_deflection.model.simulation.simulator import ForwardModel

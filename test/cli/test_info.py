@@ -70,18 +70,6 @@ def test_a_step_of_the_time_map_has_its_time_and_is_no_rate(tmp_path: Path, caps
         assert 'samples a second' not in shown
 
 
-def test_info_names_the_recorded_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with BagWriter(tmp_path / 'run', rig_values={'block_size': 20}, node='/arm/tip') as bag:
-        bag.put(block(0))
-        bag.rotate()
-        bag.put(block(1))
-    for part in (tmp_path / 'run', tmp_path / 'run' / 'run_1.mcap'):
-        assert main(['info', str(part)]) == 0
-        assert ', node /arm/tip' in capsys.readouterr().out
-    assert main(['info', str(tmp_path / 'run'), '--json']) == 0
-    assert json.loads(capsys.readouterr().out)['node'] == '/arm/tip'
-
-
 def test_info_reads_a_cut_file_and_says_so(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = bag / 'run_0.mcap'
     path.write_bytes(path.read_bytes()[:-3000])

@@ -15,7 +15,6 @@ import pytest
 from psd_deflection.cli import _fleet
 from psd_deflection.cli.main import main
 from psd_deflection.run.fleet.parquet import FAILED
-from test.recordings.making import write_bag
 
 pandas = pytest.importorskip('pandas')
 parquet = pytest.importorskip('pyarrow.parquet')
@@ -96,20 +95,6 @@ def test_what_differs_is_reported_of_each(archive: Path, capsys: pytest.CaptureF
     # A rig file that is wrong is so for all: nothing is begun.
     (archive / 'rig.yaml').write_text('/**:\n  ros__parameters:\n    amplifier: {sensitivity: -1.0}\n')
     assert main(words) == 3
-
-
-def test_info_has_a_row_for_each(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_bag(archive / 'run', {'sum_min': 1.5})
-    (archive / 'list.txt').write_text('archive/one.mcap\narchive/broken.csv\nrun\n')
-    assert main(['info', 'list.txt', '--out', 'rows.parquet']) == 8
-    reported = capsys.readouterr().out
-    assert 'archive/broken.csv' in reported
-    assert 'failed: ' in reported
-    frame = pandas.read_parquet('rows.parquet')
-    assert [Path(name).name for name in frame.recording] == ['one.mcap', 'broken.csv', 'run']
-    assert frame.lost.fillna(-1).tolist() == [0, -1, 18]
-    assert frame.error[1].startswith(str(archive / 'archive' / 'broken.csv'))
-    assert json.loads(frame.parameters[2])['sum_min'] == 1.5
 
 
 def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import itertools
 import json
 import re
 from pathlib import Path
@@ -69,36 +68,6 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_loads_and_references_are_drawn(loaded: Path, tmp_path: Path) -> None:
-    out = tmp_path / 'page.html'
-    assert main(['plot', str(loaded), '--out', str(out)]) == 0
-    content = content_of(out)
-    assert [[round(t, 2), *mark] for t, *mark in content['marks']] == [
-        [0.0, 'load', 0.0, 0.0, 0.0],
-        [1.99, 'load', 0.0, -10.0, -5.85],
-        [2.99, 'load', 10.0, 0.0, 0.0],
-    ]
-    assert column(content['loads']['fy']).tolist() == [0.0, -10.0, 0.0, 0.0]
-    assert column(content['loads']['t'], '<f8')[-1] == pytest.approx(3.98, abs=0.01)
-    references = column(content['references']['dy'])
-    assert len(references) > 100
-    assert references == pytest.approx(column(content['columns']['dy'])[: len(references)], abs=1e-4)
-    assert 'id="plot_load"' in out.read_text()
-
-
-def test_a_window_is_drawn(loaded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / 'window.html'
-    arguments = ['plot', str(loaded), '--from', '2.5', '--to', '3.5']
-    assert main([*arguments, '--out', str(out), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found['blocks'], found['samples'], found['duration_s']) == (50, 1000, pytest.approx(1.0, abs=1e-6))
-    content = content_of(out)
-    t = column(content['columns']['t'], '<f8')
-    assert (t[0], t[-1]) == (pytest.approx(2.5, abs=1e-6), pytest.approx(3.48, abs=1e-6))
-    assert [[round(m[0], 2), *m[2:]] for m in content['marks']] == [[2.5, 0.0, -10.0, -5.85], [2.99, 10.0, 0.0, 0.0]]
-    assert main([*arguments, '--out', str(tmp_path / 'window.png')]) == 0
-
-
 def test_losses_and_missing_estimates_are_marked() -> None:
     recording = open_recording(BAGS / 'lost_samples')
     drawn = Drawn(recording)
@@ -115,48 +84,6 @@ def test_losses_and_missing_estimates_are_marked() -> None:
     assert gone.tolist() == pytest.approx([100 * 0.02, 106 * 0.02], abs=1e-3)
     # Block 50 has too few samples.
     assert t[(dx != dx) & (table['lost'] > 0)].tolist() == pytest.approx([50 * 0.02], abs=1e-3)
-
-
-def test_blocks_cut_by_start_and_stop_have_lost_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from matplotlib.figure import Figure
-
-    from psd_deflection.cli.recordings.plot import _mark_losses
-    from psd_deflection.records import SampleBlock
-
-    recording = open_recording(BAGS / 'clean')
-
-    def drawn_of(numbers: list[int]) -> tuple[list[float], list[bool], int, list[str]]:
-        blocks = []
-        for b in itertools.islice(recording.blocks(), 4):
-            kept = np.isin(b.seq, numbers)
-            blocks.append(SampleBlock(b.index, b.seq[kept], b.t_ns[kept], b.volts[kept], b.flags[kept]))
-        drawn = Drawn(recording)
-        for records in replayed(recording, Pipeline(rig_at_start(recording)), blocks):
-            for record in records:
-                drawn.add(record)
-        table = drawn.table()
-        axes = Figure().add_subplot()
-        _mark_losses(axes, table)
-        estimated = [x == x for x in table['dx'].tolist()]
-        return table['lost'].tolist(), estimated, drawn.gone(), axes.get_legend_handles_labels()[1]
-
-    # Three samples of the first block, two whole ones, five of the last.
-    lost, estimated, gone, marks = drawn_of([*range(17, 65)])
-    assert lost == [0.0, 0.0, 0.0, 0.0]
-    assert estimated == [False, True, True, False]
-    assert (gone, marks) == (0, [])
-    # A gap inside the last block is one, and so is a block without an estimate for it.
-    lost, _, gone, marks = drawn_of([*range(17, 62), 64])
-    assert lost == [0.0, 0.0, 0.0, 2.0]
-    assert (gone, marks) == (2, ['no estimate', 'lost samples'])
-    integer = tmp_path / 'whole.csv'
-    assert main(['convert', str(BAGS / 'clean'), '--out', str(integer)]) == 0
-    integer.write_text('\n'.join([*integer.read_text().splitlines()[:66], '']))
-    capsys.readouterr()
-    assert main(['plot', str(integer), '--out', str(tmp_path / 'a.svg')]) == 0
-    assert re.search(r'too few samples +1 block$', capsys.readouterr().out, re.MULTILINE)
-    assert main(['replay', str(integer)]) == 0
-    assert 'no estimate: 1 block, too few samples' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -251,8 +251,7 @@ def test_a_silent_device_is_configured_again(wired: Any, run: Any, unloaded: Any
 
 
 @pytest.mark.parametrize(
-    ('model', 'message'),
-    [('1100', '4 analog inputs and no counter'), ('718B', "model '718B'; known are 1100")],
+    ('model', 'message'), [('1100', '4 analog inputs and no counter'), ('718B', "model '718B'; known are 1100")]
 )
 def test_a_model_that_will_not_do_is_named(wired: Any, unloaded: Any, model: str, message: str) -> None:
     port = wired(SimulatedDataq(unloaded(load_rig()), model=model))

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import socket
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,8 +16,6 @@ from psd_deflection.devices import survey as port_survey
 from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.serial_port import SerialPort
-from psd_deflection.devices.serve import serve
-from psd_deflection.devices.served_sockets import open_sockets
 from psd_deflection.devices.survey import serial_ports, survey
 from psd_deflection.rig.config import load_rig
 
@@ -28,32 +25,6 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_survey, 'BOOT_S', 0.3)
-
-
-@pytest.mark.parametrize('scheme', ['socket', 'udp'])
-def test_a_port_of_the_network_is_asked_too(
-    scheme: str, unloaded: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 60.0)
-    monkeypatch.setattr(port_survey, 'BOOT_S', 60.0)
-    kind = socket.SOCK_STREAM if scheme == 'socket' else socket.SOCK_DGRAM
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind(('127.0.0.1', 0))
-        name = f'{scheme}://127.0.0.1:{free.getsockname()[1]}'
-    stop = threading.Event()
-    with open_sockets(name, 1) as (line,):
-        twin = SimulatedFrames(unloaded(load_rig()))
-        thread = threading.Thread(target=serve, args=(twin, line, stop.is_set), daemon=True)
-        thread.start()
-        try:
-            assert main(['devices', name]) == 0
-        finally:
-            stop.set()
-            thread.join()
-    output = capsys.readouterr().out
-    assert 'PSD device SIM-0001' in output
-    assert f'port: "{name}"' in output
-    assert 'baud' not in output
 
 
 def test_a_name_that_is_no_port_is_a_mistake_of_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:

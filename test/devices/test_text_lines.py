@@ -164,8 +164,7 @@ def test_the_same_line_again_is_of_the_same_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ('behind', 'earlier_us', 'again'),
-    [(63, 1000, True), (64, 1000, False), (10, 2**31 - 1, True), (10, 2**31, False)],
+    ('behind', 'earlier_us', 'again'), [(63, 1000, True), (64, 1000, False), (10, 2**31 - 1, True), (10, 2**31, False)]
 )
 def test_a_line_that_comes_again_does_not_turn_back_the_clock(behind: int, earlier_us: int, again: bool) -> None:
     """Less than 64 numbers and half a turn of the clock back; else the device has started again."""

@@ -109,12 +109,7 @@ def test_messages_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     places = sorted({0, len(STREAM), *cuts})
     got = [m for a, b in itertools.pairwise(places) for m in decoder.feed(STREAM[a:b])]
     assert [type(m) for m in got] == [
-        BadFrame,
-        QuadrantReadings,
-        QuadrantReadings,
-        BadFrame,
-        QuadrantReadings,
-        QuadrantReadings,
+        *(BadFrame, QuadrantReadings, QuadrantReadings, BadFrame, QuadrantReadings, QuadrantReadings),
     ]
     assert all(is_reply(m) for m in got if isinstance(m, QuadrantReadings))
     assert got[0] == BadFrame('no APT header', 3)

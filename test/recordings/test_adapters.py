@@ -435,10 +435,7 @@ def test_a_load_is_a_force_in_the_plane_and_a_torque_about_z() -> None:
     for record in (TipLoad(T0, 1.0, 2.0, 3.0), AppliedLoad(T0, 1.0, 2.0, 3.0)):
         (m,) = to_messages(record)
         assert m.fields['header']['frame_id'] == 'link_tip_rest'
-        assert m.fields['wrench'] == {
-            'force': {'x': 1.0, 'y': 2.0, 'z': 0.0},
-            'torque': {'x': 0.0, 'y': 0.0, 'z': 3.0},
-        }
+        assert m.fields['wrench'] == {'force': {'x': 1.0, 'y': 2.0, 'z': 0.0}, 'torque': {'x': 0.0, 'y': 0.0, 'z': 3.0}}
 
 
 def test_a_mark_is_a_text_without_a_time() -> None:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from decimal import Decimal
@@ -279,17 +278,6 @@ def test_files_are_not_overwritten_and_errors_are_one_line(tmp_path: Path) -> No
     sink.close()
     with pytest.raises(RecordingError, match='is closed'):
         sink.put(block(0))
-
-
-def test_cells_may_be_quoted(tmp_path: Path) -> None:
-    path = tmp_path / 'q.csv'
-    head = ['t', *CHANNELS, 'note, of the operator']
-    rows = [[0.001 * i, *(0.5 * i + c for c in range(6)), 'said "go", and went'] for i in range(40)]
-    with path.open('w', newline='') as stream:
-        csv.writer(stream, quoting=csv.QUOTE_ALL).writerows([head, *rows])
-    recording = open_recording(path)
-    assert [s['x1'] for s in recording.samples] == [0.5 * i for i in range(40)]
-    assert recording.warnings == [f'{path}:1: columns that are not read: note, of the operator']
 
 
 def test_a_text_in_a_column_that_is_not_read_is_no_matter(tmp_path: Path) -> None:

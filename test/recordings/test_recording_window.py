@@ -27,9 +27,7 @@ from psd_deflection.records import ParameterChange
 from tools.program import ROOT
 
 BAGS = ROOT / 'bags'
-WITHOUT = {
-    'recover': 'it saves what is whole',
-}
+WITHOUT = {'recover': 'it saves what is whole'}
 """Commands that take a recording and no part of it."""
 
 

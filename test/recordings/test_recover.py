@@ -138,18 +138,6 @@ def test_a_lone_file_is_repaired(tmp_path: Path) -> None:
     assert open_recording(tmp_path / 'a.mcap').complete
 
 
-@pytest.mark.slow
-def test_only_a_damaged_chunk_is_lost_and_it_is_reported(tmp_path: Path) -> None:
-    folder = record(tmp_path / 'run')
-    content = bytearray((folder / 'run_0.mcap').read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    (folder / 'run_0.mcap').write_bytes(content)
-    cut(folder, 'run_0.mcap', len(content) - 100)
-    (file,) = recover(folder).files
-    assert any('damaged' in w for w in file.warnings)
-    assert 120 <= len(theirs(folder)['/psd/samples']) < 200
-
-
 def test_recover_rejects_a_running_recording(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / 'run', rig_values={})
     bag.put(block(0))

@@ -19,7 +19,6 @@ import psd_deflection
 from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
-from psd_deflection.recordings.write import rerun_writer
 from psd_deflection.recordings.write.rerun_writer import POSE, RerunFile, Row
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
@@ -127,17 +126,6 @@ def test_a_dot_without_light_is_taken_away(tmp_path: Path) -> None:
     times = {t for t, row in rows[f'sums/psd_{number}'] if row is not None and row[0] < 2.5}
     assert len(times) > 10
     assert not times & {t for t, row in rows[f'psd_{number}/plane/dot'] if row is not None}
-
-
-def test_rows_are_written_in_batches(
-    stand_in: MagicMock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(rerun_writer, '_BATCH', 50)
-    assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.rrd')]) == 0
-    assert 'a.rrd: 200 estimates of 200 blocks' in capsys.readouterr().out
-    sent = [call.args[0] for call in stand_in.send_columns.call_args_list]
-    assert sent.count('tip/theta') == 4
-    assert sent.count('rig/tip/plate') == 1
 
 
 def test_times_of_a_csv_are_since_its_start(stand_in: MagicMock, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from psd_deflection.arms.chains.chain import TipDeflection
-from psd_deflection.arms.chains.chain_file import ChainSettings, read_chain
+from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros.chain import chain_transforms
 from psd_deflection.run.chain import Composed
@@ -104,14 +104,3 @@ def test_the_frames_lead_from_base_to_deflected_end() -> None:
         at = at + np.array([t.translation.x, t.translation.y, t.translation.z])
         frame = sent[frame].header.frame_id
     assert at == pytest.approx(end.deflected.position, abs=1e-12)
-
-
-@pytest.mark.slow
-def test_a_prefix_is_before_every_frame() -> None:
-    file = read_chain(EXAMPLE).with_settings(ChainSettings(frame_prefix='left_'))
-    tips = file.chain.tips_under(np.array([3.0, 5.0, -2.0]), file.angles)
-    end = file.chain.compose([TipDeflection(t, np.eye(3)) for t in tips], file.angles)
-    frames = [(t.header.frame_id, t.child_frame_id) for t in chain_transforms(file, Composed(5, end))]
-    assert len(frames) == 6
-    assert [name for pair in frames for name in pair if not name.startswith('left_')] == []
-    assert ('left_base_link', 'left_end_effector_rest') in frames

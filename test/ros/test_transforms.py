@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log, texts
@@ -206,22 +204,6 @@ def test_markers_are_removed_without_an_estimate() -> None:
     assert {m.lifetime.sec for m in at_rest(RIG).markers} == {0}
     slow = load_rig(overrides={'converter.sample_rate_hz': 10.0})
     assert {m.lifetime.sec for m in moving(slow, bent_by(), dots, 10.0).markers} == {6}
-
-
-@pytest.mark.slow
-def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
-    start('--ros-args', '-p', 'markers:=true')
-    moves = peer.collect(MarkerArray, '/link_tip/markers')
-    peer.until(lambda: len(moves) >= 5, 'moving markers')
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    rest = peer.collect(MarkerArray, '/link_tip/markers_at_rest', latched)
-    peer.until(lambda: len(rest) >= 1, 'the latched markers')
-    assert {m.ns for m in rest[0].markers} == {'link_at_rest', 'laser', 'beam'}
-    assert {m.ns for m in moves[-1].markers} == {'link', 'plate', 'psd', 'dot'}
-    put = Parameter('psd_1.zero', value=[0.001, 0.0]).to_parameter_msg()
-    peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[put]))
-    x = RIG.psds[0].center[0] + 0.001
-    peer.until(lambda: by_name(rest[-1])['beam', 1].points[0].x == pytest.approx(x), 'the beam at the new zero')
 
 
 def test_markers_are_in_prefixed_frames() -> None:

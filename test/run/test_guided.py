@@ -25,15 +25,7 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     assert found.verdict == WRONG
     assert dict(found.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
     prompts = [text[:12] for text in logged if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
-    assert prompts == [
-        'Leave the li',
-        '1 of 3: Push',
-        'Let go.',
-        '2 of 3: Push',
-        'Let go.',
-        '3 of 3: Turn',
-        'Let go.',
-    ]
+    assert prompts == ['Leave the li', '1 of 3: Push', 'Let go.', '2 of 3: Push', 'Let go.', '3 of 3: Turn', 'Let go.']
     assert max(shown) > 0.9
 
 

@@ -12,13 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from psd_deflection.model.detector import (
-    Quadrant,
-    VoltsToDots,
-    counts_to_volts,
-    dot_noise_variances,
-    make_sensor,
-)
+from psd_deflection.model.detector import Quadrant, VoltsToDots, counts_to_volts, dot_noise_variances, make_sensor
 from psd_deflection.rig.config import replace_values, rig_from_values
 from psd_deflection.rig.declarations import SENSOR_TYPES, PsdConfig
 

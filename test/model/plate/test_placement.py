@@ -59,11 +59,7 @@ def test_two_sensors_leave_a_direction_unseen() -> None:
 
 @pytest.mark.parametrize(
     ('room', 'expected'),
-    [
-        (Room(0.100), 1.0),
-        (Room(0.100, keep_out=0.030), 1.0),
-        (Room(0.080, box=(-0.2, -0.2, 0.2, 0.2)), 1.25),
-    ],
+    [(Room(0.100), 1.0), (Room(0.100, keep_out=0.030), 1.0), (Room(0.080, box=(-0.2, -0.2, 0.2, 0.2)), 1.25)],
 )
 def test_a_round_room_wants_its_sensors_opposite(room: Room, expected: float) -> None:
     pair = placement.best_pair(room)

@@ -315,14 +315,7 @@ def test_a_second_mode_rings_as_its_equation_says(shares: int, phase: float) -> 
             def change(t: float, s: FloatArray, load: float = load) -> tuple[float, float]:
                 return float(s[1]), w * w * (load - float(s[0])) - 2.0 * zeta * w * float(s[1])
 
-            found = solve_ivp(
-                change,
-                (at, end),
-                state,
-                t_eval=[at + phase, end],
-                rtol=1e-9,
-                atol=1e-14,
-            )
+            found = solve_ivp(change, (at, end), state, t_eval=[at + phase, end], rtol=1e-9, atol=1e-14)
             out.append(float(found.y[0, 0]))
             state, at = found.y[:, 1], end
         return out

@@ -17,16 +17,7 @@ from psd_deflection.measure.correction import Correction
 from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.law_files import read_law
-from psd_deflection.model.simulation.laws import (
-    FORMS,
-    TARGETS,
-    Law,
-    LawTerm,
-    effect_of,
-    law_text,
-    unit_of,
-    values_of,
-)
+from psd_deflection.model.simulation.laws import FORMS, TARGETS, Law, LawTerm, effect_of, law_text, unit_of, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig

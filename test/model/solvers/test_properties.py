@@ -46,13 +46,7 @@ def close(got: Any, want: Any) -> None:
 @pytest.mark.parametrize('variances', [ISOTROPIC, UNEQUAL])
 @pytest.mark.parametrize(
     ('method', 'options'),
-    [
-        ('exact', {}),
-        ('wls_exact', {}),
-        ('wls_exact', {'weights': 'thesis'}),
-        ('iterative', {}),
-        ('minimum_tilt', {}),
-    ],
+    [('exact', {}), ('wls_exact', {}), ('wls_exact', {'weights': 'thesis'}), ('iterative', {}), ('minimum_tilt', {})],
 )
 @many
 @given(geometry=two_psds(), pose=poses)

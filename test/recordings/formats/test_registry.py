@@ -95,18 +95,13 @@ def page() -> tuple[str, str]:
 
 
 def test_a_format_made_as_the_page_says_is_read_like_ours(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    page: tuple[str, str],
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, page: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     install_plug_in(tmp_path, monkeypatch, 'logger', *page)
     path = tmp_path / 'run.npz'
     t = np.arange(100) / 1000.0
     np.savez(path, t=t, volts=np.ones((100, 6)))
-    recording = pd.open(
-        path,
-    )
+    recording = pd.open(path)
     assert recording.samples['t_ns'].tolist() == (np.arange(100) * 10**6).tolist()
     assert '.npz' in endings_of_recordings()
     assert listed([str(tmp_path / '*.npz')]) == [str(path)]

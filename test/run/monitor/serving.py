@@ -13,13 +13,7 @@ import numpy as np
 
 from psd_deflection.base.log import texts
 from psd_deflection.measure.watch import Alarm
-from psd_deflection.records import (
-    BlockStatus,
-    DeflectionEstimate,
-    DiagnosticEntry,
-    DiagnosticReport,
-    SpotMeans,
-)
+from psd_deflection.records import BlockStatus, DeflectionEstimate, DiagnosticEntry, DiagnosticReport, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.monitor.feed import Feed
 from psd_deflection.run.monitor.metrics import Family, counter

@@ -72,17 +72,6 @@ def test_why_it_could_not_is_reported(serve: Serve, tmp_path: Path) -> None:
     assert 'recordings/test: is not on this machine' in ended['last']
 
 
-def test_it_ends_with_the_daemon(serve: Serve, bag: Path, tmp_path: Path) -> None:
-    serving = serve(bag_dir=str(tmp_path / 'made'))
-    serving.shown.folder = str(bag)
-    assert asked(serving.url, True)[0] == 200
-    calibrations(serving.url, lambda c: 'parameters' in c)
-    process = serving.server._calibration._process
-    serving.server.close()
-    assert process is not None
-    assert process.returncode is not None
-
-
 def test_a_played_recording_and_nonsense_are_rejected(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve()
     assert asked(serving.url, 1) == (400, 'rejected: expected {"calibrate": true} or {"calibrate": false}')

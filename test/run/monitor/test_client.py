@@ -170,15 +170,6 @@ def test_echo_prints_new_blocks(serve: Serve, capsys: pytest.CaptureFixture[str]
             assert second.endswith('no estimate: laser lost  lost 2')
 
 
-def test_echo_says_when_the_daemon_ends(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
-    serving = serve()
-    ender = threading.Timer(0.2, serving.server.close)
-    ender.start()
-    assert main(['echo']) == 7
-    ender.join()
-    assert 'closed the connection' in capsys.readouterr().err
-
-
 def test_the_token_of_an_own_daemon_on_the_network_is_found(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
     serving = serve(monitor_control=True, monitor_address='0.0.0.0')
     assert main(['zero']) == 0

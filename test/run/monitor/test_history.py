@@ -47,11 +47,7 @@ def window(made: History, since: float, until: float, points: int = 2000) -> Win
 
 
 finite = st.floats(-1e-2, 1e-2)
-steps = st.one_of(
-    st.integers(1, SECOND),
-    st.integers(SECOND, 100 * SECOND),
-    st.integers(-10 * SECOND, 0),
-)
+steps = st.one_of(st.integers(1, SECOND), st.integers(SECOND, 100 * SECOND), st.integers(-10 * SECOND, 0))
 blocks = st.lists(
     st.tuples(steps, st.none() | finite, finite | st.just(math.nan), st.integers(0, SIZE), st.integers(0, 3)),
     min_size=1,

@@ -10,8 +10,6 @@ import pytest
 
 pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
 
-from selenium.webdriver.common.action_chains import ActionChains
-from selenium.webdriver.common.by import By
 
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import BlockStatus, Mark
@@ -101,28 +99,3 @@ def test_a_mark_a_gap_and_an_alarm_are_observed_in_the_hour(page: Page, hour: Se
     choose(page, '30 s')
     page.until(f'{OPEN} === undefined && {CELL} === ""')
     assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
-
-
-@pytest.mark.slow
-def test_cell_under_cursor_is_reported_and_zoom_loads(page: Page, hour: Serving) -> None:
-    page.open(hour.url)
-    page.until('document.body.dataset.rows > 0')
-    choose(page, '24 h')
-    page.until(f'{CELL}.startsWith("a point is the mean of 3 min")')
-    choose(page, '1 h')
-    page.until(f'{CELL}.startsWith("a point is the mean of 6 s")')
-    plot = page.driver.find_element(By.CSS_SELECTOR, '#plot_shift .u-over')
-    wide = plot.size['width']
-    ActionChains(page.driver).move_to_element_with_offset(plot, wide // 2 - 3, 0).perform()
-    page.until(f'{CELL}.includes("blocks without an estimate")')
-    ActionChains(page.driver).move_to_element_with_offset(plot, wide // 4, 0).perform()
-    page.until(f'/ \\+ 6 s: ΔX .* \\(.* to .*\\) µm, ΔY .* µm, θ .* mdeg$/.test({CELL})')
-    assert page.js('document.querySelector(\'[data-plot="shift"][data-series="1"] output\').textContent') != ''
-    ActionChains(page.driver).click_and_hold().move_by_offset(wide // 8, 0).release().perform()
-    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "true"')
-    page.until(f'/^a point is the mean of 1 s|\\+ 1 s: /.test({CELL})')
-    ActionChains(page.driver).double_click(plot).perform()
-    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "false"')
-    page.until(f'/^a point is the mean of 6 s|\\+ 6 s: /.test({CELL})')
-    choose(page, '30 s')
-    assert page.complaints() == []

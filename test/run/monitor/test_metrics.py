@@ -12,7 +12,6 @@ import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parsed
 
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.records import BlockStatus
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import server
 from psd_deflection.run.monitor.feed import BlockResult
@@ -56,17 +55,6 @@ def test_a_scrape_has_counters_and_the_newest_estimate(serve: Serve, monkeypatch
     assert after[('psd_deflection_twist_radians',)] == best.theta
     assert after[('psd_deflection_sum_volts', '2')] == 5.0
     assert after[('psd_deflection_page_dropped_total',)] == 0.0
-
-
-def test_a_block_without_an_estimate_has_none_here(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, 'FRESH_S', math.inf)
-    serving = serve()
-    serving.give(0, 1)
-    serving.give(1, 1, status=BlockStatus.LASER_LOST)
-    shown(serving, 1)
-    found = scraped(serving)
-    assert ('psd_deflection_sum_volts', '1') in found
-    assert not any('meters' in key[0] or 'radians' in key[0] for key in found)
 
 
 def test_the_estimate_of_a_device_that_is_away_is_no_estimate(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:

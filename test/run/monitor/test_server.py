@@ -103,16 +103,6 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     assert health['sum_min'] == serving.rig.estimator.sum_min
 
 
-def test_it_remembers_a_minute_and_not_more(serve: Serve) -> None:
-    serving = serve()
-    for first in range(0, 5000, 500):
-        serving.give(first, 500)
-        # Taken in between, as in life: the queue is for a pause, not for a minute.
-        listen(serving.url, lambda m, last=first + 499: any(r[1] == last for r in m.get('rows', [])))  # type: ignore[misc]
-    rows = rows_in(listen(serving.url, lambda m: 'rows' in m))
-    assert [r[1] for r in rows] == list(range(2000, 5000))
-
-
 def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> None:
     serving = serve()
     status, page, headers = ask(serving.url, 'GET')

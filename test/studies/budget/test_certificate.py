@@ -60,10 +60,7 @@ def _tree() -> dict[str, Any]:
     return {
         'kind': 'reference',
         'rejected': '',
-        'parameters': {
-            'psd_1.rotation': {'value': 0.012, 'used': 0.0},
-            'psd_2.gain_y': {'value': 1e-3, 'used': 5e-3},
-        },
+        'parameters': {'psd_1.rotation': {'value': 0.012, 'used': 0.0}, 'psd_2.gain_y': {'value': 1e-3, 'used': 5e-3}},
         'reference': {'rows': 60, 'outliers': 7},
         'range': {'low': [-2e-3, -2.5e-3, -0.02], 'high': [1e-3, 2e-3, 0.03]},
         'provenance': {

@@ -16,12 +16,7 @@ from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate.calibrate import calibrate
-from psd_deflection.studies.calibrate.dark import (
-    dark_levels,
-    result_of_levels,
-    values_of_levels,
-    words_of_level,
-)
+from psd_deflection.studies.calibrate.dark import dark_levels, result_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 
 RATE = 1000

@@ -172,11 +172,7 @@ def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
     [
         ([push('fx'), push('fy')], 'tz', 'record again with a torque about Z alone too'),
         ([push('fy'), push('tz')], 'fx', 'record again with a load along X alone too'),
-        (
-            [push('fx')],
-            'fy tz',
-            'record again, one after the other: a load along Y alone, a torque about Z alone',
-        ),
+        ([push('fx')], 'fy tz', 'record again, one after the other: a load along Y alone, a torque about Z alone'),
         (
             [],
             'fx fy tz',
@@ -256,8 +252,7 @@ def test_a_sum_between_its_limits_is_light_enough(sums: tuple[float, float], lig
 
 
 @pytest.mark.parametrize(
-    ('level', 'reported'),
-    [(5.74, False), (5.76, True), (4.35, False), (4.34, True), (7.5, True), (7.6, False)],
+    ('level', 'reported'), [(5.74, False), (5.76, True), (4.35, False), (4.34, True), (7.5, True), (7.6, False)]
 )
 def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, reported: bool) -> None:
     found = checked(levels=of_levels(sums=(5.0, level)))

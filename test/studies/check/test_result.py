@@ -29,13 +29,7 @@ from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFi
 
 RIG = load_rig(overrides={'psd_1.axes': ['-x', 'y']})
 LEVELS = Levels(
-    np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5]) * 1e-3,
-    2.2e-3,
-    np.zeros(6),
-    50.0,
-    np.array([4.5, 5.25]),
-    (),
-    np.zeros(6),
+    np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5]) * 1e-3, 2.2e-3, np.zeros(6), 50.0, np.array([4.5, 5.25]), (), np.zeros(6)
 )
 PUSHES = (
     PushResponse(
@@ -160,20 +154,7 @@ def test_push_rows_list_expected_channels_of_rig_file() -> None:
     assert [len(row) for row in push_rows(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
     assert CHECKUP.lines()[1].split() == [
-        'push',
-        'x1',
-        'µm',
-        'y1',
-        'µm',
-        'x2',
-        'µm',
-        'y2',
-        'µm',
-        'x1',
-        'y1',
-        'x2',
-        'y2',
-        'size',
+        *('push', 'x1', 'µm', 'y1', 'µm', 'x2', 'µm', 'y2', 'µm', 'x1', 'y1', 'x2', 'y2', 'size'),
     ]
 
 

@@ -37,11 +37,7 @@ from psd_deflection.studies.discover.search.signatures import Candidate, candida
 from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, Unknown, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
-from psd_deflection.studies.discover.setup.setup import (
-    finding_of_effect,
-    likely_delays,
-    likely_jumps,
-)
+from psd_deflection.studies.discover.setup.setup import finding_of_effect, likely_delays, likely_jumps
 
 from .test_formulas import RIG, make_observation
 
@@ -193,10 +189,7 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     part = 0.01 * np.random.default_rng(0).standard_normal((6, 300))
     part[4, 120:] += 2.0
     part[3, 120:] -= 1.0
-    fake = cast(
-        Workspace,
-        SimpleNamespace(split=lambda r: [r, r[:, :49]], fine=[4, 4], observations=[o, o]),
-    )
+    fake = cast(Workspace, SimpleNamespace(split=lambda r: [r, r[:, :49]], fine=[4, 4], observations=[o, o]))
     # n1 n2/n (2^2 + 1^2) = 360: beyond 50.
     for size in (1.0, 0.4):
         ((recording, psd, time),) = likely_jumps(fake, size * part)

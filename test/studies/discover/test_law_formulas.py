@@ -103,10 +103,7 @@ def test_what_a_target_lacks_is_estimated_with_its_weight(observed: tuple[Worksp
         np.testing.assert_allclose(r.error[t], part[3 * i + 2] * noise.innovation[3 * i + 2], rtol=1e-9)
     assert (r.period, r.fine) == (1e-3, 4)
     dynamics = RIG.dynamics
-    assert r.rings == (
-        round(1.0 / dynamics.bending_frequency / 0.004),
-        round(1.0 / dynamics.torsion_frequency / 0.004),
-    )
+    assert r.rings == (round(1.0 / dynamics.bending_frequency / 0.004), round(1.0 / dynamics.torsion_frequency / 0.004))
 
 
 @pytest.mark.parametrize('seed', range(6))

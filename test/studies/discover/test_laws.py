@@ -37,8 +37,6 @@ from .test_formulas import make_observation
 
 RIG = load_rig()
 HISTORY = loads.identification().loads
-STEPS = 20_000
-"""Samples of it in which the load is stepped."""
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
 SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 
@@ -110,19 +108,6 @@ def test_noise_beside_a_movement_is_no_law() -> None:
         share = floors * ws.floor() / ws.gap(odd)
         difference = [a + share * b for a, b in zip(null.difference, odd, strict=True)]
         assert find_jitter(ws, dataclasses.replace(null, difference=difference), penalty) is None
-
-
-@pytest.mark.slow
-def test_what_switches_with_the_loads_is_no_law_of_times() -> None:
-    # Without the sweep, in which the load changes all the time.
-    changes = np.flatnonzero(np.any(np.diff(HISTORY[:STEPS], axis=0) != 0.0, axis=1)) * 1e-3
-    for times, reported in ((changes[1:4] + 0.1, False), (changes[1:4] + 0.7, True)):
-        term = LawTerm('switched', (), 3e-6, times=tuple(times.tolist()))
-        ws = workspace(Law('bump', 'psd', 'x1', (term,)), count=STEPS)
-        null = refit(ws, ())
-        found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
-        switched = found is not None and any(t.times for law in found.laws for t in law.terms)
-        assert switched is reported
 
 
 def test_law_with_large_held_out_gap_is_not_written() -> None:
@@ -229,15 +214,3 @@ def test_a_plant_that_contradicts_itself_is_rejected(change: Mapping[str, object
         plant.observed = []
     with pytest.raises(ConfigError, match=words):
         psd_deflection.discover_in(plant)
-
-
-@pytest.mark.slow
-def test_what_swings_on_is_no_noise_though_none_is_stated() -> None:
-    """The verdict says what the sentence says."""
-    plant = Spring(0.0)
-    plant.period = 0.01
-    plant.library = (LIMIT,)
-    plant.observed = [rows + 0.05 * np.sin(np.linspace(0.0, 9.0, 50)) for rows in plant.observed]
-    found = psd_deflection.discover_in(plant)
-    assert (found.verdict, found.effects) == ('unknown_effect', ())
-    assert 'remain, which is no noise' in found.unknown[0].signature or 'follows' in found.unknown[0].signature

@@ -32,13 +32,7 @@ from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap, heldout_residual
-from psd_deflection.studies.discover.search.localise import (
-    NOWHERE,
-    Cell,
-    Localisation,
-    dependences,
-    regressors,
-)
+from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation, dependences, regressors
 from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
@@ -46,10 +40,7 @@ from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.trials import wald_chi_square
 from psd_deflection.studies.discover.search.weighing import covariance_of, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.noise import (
-    NoiseModel,
-    estimate_noise,
-)
+from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 from psd_deflection.studies.discover.steps import accepted, alternatives, credible
 from psd_deflection.studies.loads.fine import fine_means
 

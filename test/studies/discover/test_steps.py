@@ -120,9 +120,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
 
 
-def test_effects_are_added_until_budget_ends(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     names = 'abcdef'
     shown = pictures(*((n, 'x') for n in names))
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())

@@ -21,10 +21,7 @@ from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.from_recordings import read_tables
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.plant_search import discover_in
-from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.redundant import fourth, fourth_reading
 from psd_deflection.studies.discover.setup.setup import correct_wiring
@@ -47,11 +44,7 @@ def make_observation(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, o
 
 
 @pytest.mark.parametrize(
-    ('word', 'name', 'value'),
-    [
-        ('sensor_rotation,psd=3,angle=0.01', 'angle', 0.01),
-        ('load_offset,x=0.01', 'x', 0.01),
-    ],
+    ('word', 'name', 'value'), [('sensor_rotation,psd=3,angle=0.01', 'angle', 0.01), ('load_offset,x=0.01', 'x', 0.01)]
 )
 def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: float) -> None:
     (effect,) = (found := discover([make_observation(RIG, word)])).effects
@@ -94,18 +87,6 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
     assert [e.name for e in catalogue().values()] == [e.name for e in catalogue(6).values()]
     with pytest.raises(ConfigError, match='amplitude_x3'):
         with_effects(TWO, ['mains_interference,amplitude_x3=0.01'], 'test')
-
-
-@pytest.mark.slow
-def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
-    """No parameter says it, so there is no line for it."""
-    right = make_observation(RIG, world={'psd_1.axes': ['x', '-y']})
-    exchanged = dataclasses.replace(right, volts=right.volts[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]])
-    (corrected,), findings, lines = correct_wiring([exchanged], ())
-    assert [(f.name, f.where) for f in findings] == [('psd_swap', 'psd_1 psd_3'), ('channel_sign', 'y3')]
-    assert findings[0].fix.startswith('exchange the cables of psd_1 and psd_3 at the device')
-    assert lines == {'psd_1.axes': ['x', '-y']}
-    assert corrected.volts == pytest.approx(right.volts * [1, -1, 1, *[1] * 6])
 
 
 def test_a_crossed_wiring_goes_to_the_device_and_back() -> None:
@@ -224,30 +205,3 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
 def test_volts_of_wrong_number_of_psds_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
         Observation('x', SIX, make_observation(RIG).volts, LOADS)
-
-
-@pytest.mark.slow
-def test_a_table_of_readings_may_be_of_three_psds(tmp_path: Path) -> None:
-    levels = np.array(
-        [(0, 0, 0), (0, -5, 0), (0, -10, 0), (0, -30, 0), (0, -10, -5.85), (0, -50, -29.25), (20, 0, 0), (-20, 0, 0)],
-        float,
-    )
-    rotated = make_active('sensor_rotation', {'psd': 3, 'angle': 0.02}, 'test')
-    blank = Readings('table', RIG, 'dots', levels, np.zeros((len(levels), 6)))
-    dots = ReadingsPlant([blank]).simulate_effects([rotated])[0].T * 1e-3
-    dots += np.random.default_rng(0).normal(0.0, 1e-3, dots.shape)
-    header = ','.join(('load_fx,load_fy,load_tz', *(f'{name}_mm' for name in dot_names(3))))
-    rows = [','.join(f'{v:.6g}' for v in (*load, *row)) for load, row in zip(levels, dots, strict=True)]
-    path = tmp_path / 'hung.csv'
-    path.write_text('\n'.join((header, *rows)) + '\n', encoding='utf-8')
-    (table,) = read_tables([path], RIG)
-    assert table.values == pytest.approx(1e-3 * dots, abs=1e-8)
-    found = discover_in(ReadingsPlant([table]))
-    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 3)']
-    with pytest.raises(RecordingError, match='has readings of 3 PSDs, the rig file has 2'):
-        read_tables([path], TWO)
-    with pytest.raises(RecordingError, match=r'table: is of 6 PSDs, .*hung.csv of 3'):
-        ReadingsPlant([table, Readings('table', SIX, 'dots', levels, np.zeros((len(levels), 12)))])
-    path.write_text(path.read_text(encoding='utf-8').replace('y3_mm', 'z'), encoding='utf-8')
-    with pytest.raises(RecordingError, match='the header lacks y3_mm beside the other readings'):
-        read_tables([path], RIG)

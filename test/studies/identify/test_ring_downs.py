@@ -212,10 +212,7 @@ def test_modes_that_beat_are_added_until_nothing_is_left() -> None:
 
 
 def trimmed(
-    scatter: Sequence[float],
-    monkeypatch: pytest.MonkeyPatch,
-    pattern: Sequence[float] = (1.0, -1.0),
-    piece: int = 16,
+    scatter: Sequence[float], monkeypatch: pytest.MonkeyPatch, pattern: Sequence[float] = (1.0, -1.0), piece: int = 16
 ) -> tuple[int, int] | None:
     """What is kept of pieces of so many samples, a quarter of a period, that leave so much."""
     samples = np.zeros(3000)

@@ -16,13 +16,7 @@ from psd_deflection.studies.calibrate.from_recordings import with_effective_load
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.loads.annotated_times import (
-    ALIKE_S,
-    CorrectedLoads,
-    CorrectedNote,
-    correct_loads,
-    shifted,
-)
+from psd_deflection.studies.loads.annotated_times import ALIKE_S, CorrectedLoads, CorrectedNote, correct_loads, shifted
 from test.studies.held_loads import RIG, answers, read
 
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)

@@ -14,13 +14,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.studies.loads import plateaus
 from psd_deflection.studies.loads.annotated_times import correct_loads, unannotated_steps
-from psd_deflection.studies.loads.plateaus import (
-    Plateau,
-    PlateauLoads,
-    all_free,
-    as_applied,
-    wrong_notes,
-)
+from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, all_free, as_applied, wrong_notes
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, annotated_as, answers, read
 
 QUIET = read(HELD)
