@@ -23,7 +23,6 @@ from pathlib import Path
 
 import numpy as np
 
-from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
@@ -69,7 +68,7 @@ class Arm(Plant):
     library = LIBRARY
     period = 1.0 / RATE
 
-    def __init__(self, folder: Path = DATA / 'two_link_arm') -> None:
+    def __init__(self, folder: Path) -> None:
         """``folder`` holds ``excerpt.csv``. Raises OSError if it does not."""
         rows: dict[str, list[list[float]]] = {}
         with (folder / 'excerpt.csv').open(newline='') as stream:

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
@@ -40,15 +39,13 @@ def _harmonics() -> list[str]:
 
 
 class AuxTel(Plant):
-    """``known``: physical terms that the model has; ``without``: terms that are not in the library."""
+    """``known``: physical terms that the model has."""
 
     channels = ('across', 'up')
     units = ('arcsec', 'arcsec')
     cases = ('night',)
 
-    def __init__(
-        self, path: Path = DATA / 'auxtel.txt', known: Sequence[str] = (), without: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, path: Path, known: Sequence[str] = ()) -> None:
         """Raises OSError if there is no file."""
         with path.open() as stream:
             rows = np.radians(np.loadtxt(stream))
@@ -57,7 +54,7 @@ class AuxTel(Plant):
         self._observed = ARCSECONDS * np.stack([rotated * np.cos(self.elevation), rows[:, 3] - self.elevation])
         self.nuisance = tuple(_term(name) for name in ('IA', 'IE', *known))
         names = [*PHYSICAL, *_harmonics()]
-        self.library = tuple(_term(name) for name in names if name not in {*known, *without})
+        self.library = tuple(_term(name) for name in names if name not in known)
 
     def measured(self) -> list[FloatArray]:
         """How far across and up, arcsec on the sky, each star was from where it was commanded."""

@@ -19,7 +19,6 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
@@ -94,7 +93,7 @@ class Balls(Plant):
     noise = (READING,)
     period = 1.0 / 15.0
 
-    def __init__(self, folder: Path = DATA / 'falling_balls', drop: int = 1) -> None:
+    def __init__(self, folder: Path, drop: int = 1) -> None:
         """Raises OSError if ``folder`` has no such file, ValueError if a ball is not in it."""
         tables = read(folder / FILE)
         missing = sorted(set(BALLS) - set(tables))

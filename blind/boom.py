@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
@@ -54,16 +53,15 @@ class Boom(Plant):
     nuisance = (STIFFNESS,)
     noise = (READING,)
 
-    def __init__(self, folder: Path = DATA / 'boom', weighed: bool = False, without: tuple[str, ...] = ()) -> None:
-        """Raises OSError if ``folder`` has no ``readings.csv``. ``without``: effects that are not in the library."""
+    def __init__(self, folder: Path, weighed: bool = False) -> None:
+        """Raises OSError if ``folder`` has no ``readings.csv``."""
         with (folder / 'readings.csv').open(newline='') as stream:
             rows = np.array([[float(v) for v in row] for row in list(csv.reader(stream))[1:]]) * [1e-3, 1.0, 1e-3, 1e-3]
         self.lengths = np.unique(rows[:, 0])
         self.cases = tuple(f'{1e3 * v:.0f} mm' for v in self.lengths)
         self._rows = [rows[rows[:, 0] == v] for v in self.lengths]
         self._weighed = (0.188 * 9.81, 0.25) if weighed else (0.0, 0.0)
-        library = (TIP_FORCE, CLAMP, ROOT, TILT) if weighed else (SELF_WEIGHT, TIP_FORCE, CLAMP, ROOT, TILT)
-        self.library = tuple(e for e in library if e.name not in without)
+        self.library = (*(() if weighed else (SELF_WEIGHT,)), TIP_FORCE, CLAMP, ROOT, TILT)
 
     def measured(self) -> list[FloatArray]:
         """Return the deflection, m, of each reading, length by length."""

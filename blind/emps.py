@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat
 
-from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
@@ -24,6 +23,7 @@ from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 MASS, VISCOUS, COULOMB, OFFSET, GAIN = 95.1089, 203.5034, 20.3935, -3.1648, 35.15065
 """kg, N s/m, N, N, N/V, as published."""
 RATE = 1000.0
+STEP = 2  # Samples a step of the simulation.
 KEPT = 10
 """Every tenth sample of the position is compared."""
 SEGMENT_S = 2.0
@@ -66,16 +66,14 @@ class Emps(Plant):
 
     def __init__(
         self,
-        without: Sequence[str] = (),
-        folder: Path = DATA / 'emps',
-        step: int = 2,
+        without: Sequence[str],
+        folder: Path,
         record: str = 'emps.csv',
         segment: float = SEGMENT_S,
     ) -> None:
-        """``step``: samples a step of the simulation. ``record``: a file, ``.csv`` or the benchmark's ``.mat``;
-        ``segment``: s after which the simulation starts again. Raises OSError if ``folder`` has no such file.
+        """``record``: a file, ``.csv`` or the benchmark's ``.mat``; ``segment``: s after which the simulation starts
+        again. Raises OSError if ``folder`` has no such file.
         """
-        self._step = step
         rows = _read(folder / record)
         n = round(segment * RATE)
         count = len(rows) // n
@@ -118,12 +116,12 @@ class Emps(Plant):
         at = np.clip(np.arange(n) - of('input_delay', 'delay') * RATE, 0.0, n - 1.0)
         low = np.minimum(at.astype(np.int64), n - 2)
         voltage = self._voltage[:, low] + (at - low) * (self._voltage[:, low + 1] - self._voltage[:, low])
-        means = voltage.reshape(len(voltage), -1, self._step).mean(axis=2)
+        means = voltage.reshape(len(voltage), -1, STEP).mean(axis=2)
         force = (GAIN * (1.0 + of('drive_gain', 'scale')) * means - offset).T
         q, v = self._start[0].copy(), self._start[1].copy()
         out = np.empty((len(force), len(q)))
         # With the force held over a step, viscous friction is exact.
-        h = self._step / RATE
+        h = STEP / RATE
         fade = np.exp(-h * viscous / mass)
         gain = (1.0 - fade) / viscous
         for i, given in enumerate(force):
@@ -136,5 +134,5 @@ class Emps(Plant):
             after = np.sign(free) * np.maximum(np.abs(free) - gain * coulomb, 0.0)
             q = q + 0.5 * h * (v + after)
             v = after
-        observed = out[:: KEPT // self._step].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
+        observed = out[:: KEPT // STEP].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
         return [row[None, :] for row in observed]

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from blind import byhand, score, suite_peers
+from blind import byhand, score
 from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, possible, scaled, short_cases
 from blind.mistakes import observed
@@ -68,8 +68,8 @@ def _rig(case: Case, observed: Sequence[Observation]) -> Rig:
     return observed[0].rig if case.mistake[0] else load_rig()
 
 
-def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
-    fields, truth, target, peer = job
+def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
+    fields, truth, target = job
     case = Case(
         **{
             **fields,
@@ -79,11 +79,7 @@ def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | Non
         }
     )
     start = time.perf_counter()
-    if peer:
-        observed = observe(case, truth)
-        got = suite_peers.answer(peer, observed, _rig(case, observed), case.without)
-    else:
-        got, _ = answer(case, truth)
+    got, _ = answer(case, truth)
     got['seconds'] = time.perf_counter() - start
     path = Path(target)
     partial = path.with_suffix('.partial')
@@ -147,30 +143,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
     parser = options(__doc__, jobs=1)
     chosen = selection(parser)
-    parser.add_argument('--peer', choices=tuple(suite_peers.PEERS), help='who answers instead of discover')
     parser.add_argument('--score', action='store_true', help='only score the answers that are there, of any tool')
     args = parser.parse_args(argv)
-    if args.peer and (lacks := suite_peers.lacking(args.peer)):
-        parser.error(f'--peer {args.peer}: {lacks}')
     folder = Path(args.out)
-    # Nobody's answers are taken for another's.
-    whose = f'-{args.peer}' if args.peer else ''
-    summary = folder / f'summary{whose}.txt'
+    summary = folder / 'summary.txt'
     if args.score:
         keys = [p.stem for p in sorted((folder / 'sealed').glob('*.json')) if args.only in p.stem]
-        return conclude(*score.summary(score.load(folder, keys, f'answers{whose}')), summary)
+        return conclude(*score.summary(score.load(folder, keys)), summary)
     cases = chosen(args)
     print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
-    (folder / f'answers{whose}').mkdir(parents=True, exist_ok=True)
+    (folder / 'answers').mkdir(parents=True, exist_ok=True)
     jobs = []
     for case in cases:
-        target = folder / f'answers{whose}' / f'{case.key}.json'
+        target = folder / 'answers' / f'{case.key}.json'
         if not target.exists():
             sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
-            jobs.append((sealed['case'], sealed['truth'], str(target), args.peer))
+            jobs.append((sealed['case'], sealed['truth'], str(target)))
     for _ in over(_answer_case, jobs, args.jobs, 'answers'):
         pass
-    return conclude(*score.summary(score.load(folder, [c.key for c in cases], f'answers{whose}')), summary)
+    return conclude(*score.summary(score.load(folder, [c.key for c in cases])), summary)
 
 
 if __name__ == '__main__':

@@ -84,11 +84,11 @@ def complete(answer: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def load(folder: Path, keys: Sequence[str], answers: str = 'answers') -> list[Row]:
-    """Return every case that has an answer in the folder ``answers``."""
+def load(folder: Path, keys: Sequence[str]) -> list[Row]:
+    """Return every case that has an answer."""
     out = []
     for key in keys:
-        answer = folder / answers / f'{key}.json'
+        answer = folder / 'answers' / f'{key}.json'
         if not answer.exists():
             continue
         sealed = json.loads((folder / 'sealed' / f'{key}.json').read_text())

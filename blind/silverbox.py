@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import expm
 
-from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
@@ -99,7 +98,7 @@ class Silverbox(Plant):
 
     def __init__(
         self,
-        folder: Path = DATA / 'silverbox',
+        folder: Path,
         train: tuple[int, int] = TRAIN,
         shape: tuple[int, int] = (CASES, COLUMNS),
     ) -> None:

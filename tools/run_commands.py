@@ -96,7 +96,6 @@ SHORTER = {
     r'^python -m blind\.faults$': '--rows 1',
     r'^python -m blind\.coverage --alarms \d+$': '--alarms 1 --rows 1',
     r'^python -m blind\.coverage --vibration \d+$': '--vibration 1',
-    r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.given$': '--hand 2 --only hand-late',
     r'^python -m blind\.watch\b': '--runs 1 --hours 0',
@@ -128,7 +127,7 @@ ADMINISTRATION = re.compile(
 HOURS = re.compile(r'^make mutants\b')
 """Campaigns whose shortest form says nothing: never run here."""
 
-FOREIGN = re.compile(r'^(python -m blind\.(foreign|duels)\b|make campaign NAME=duels\b)')
+FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b)')
 """Reads data of others, which are not in the repository: test_duels.py does, if it is there."""
 
 NO_CAMPAIGNS = '--no-campaigns'

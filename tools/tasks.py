@@ -107,9 +107,7 @@ CAMPAIGNS = {
         '--runs 1 --hours 0',
         'slip of ',
     ),
-    'duels': Task(
-        'python -m blind.duels', "discover beside other programs on others' machines, PSD_FOREIGN_DATA (10 min)"
-    ),
+    'duels': Task('python -m blind.duels', "discover beside other methods on others' machines, PSD_FOREIGN_DATA (1 h)"),
 }
 
 DEMOS = {
