@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make bench``: the error of the estimates against the simulated truth, beside the lower bound for any method.
-
-The Cramér–Rao bound comes from the dots' own equation (m = R(-theta)(l - d) - c, differentiated by differences) and
-from the noise that the rig file states: amplifier noise and one converter step, in the mean of a block.
-"""
-
-from __future__ import annotations
+"""``make bench``: the error of the estimates against the simulated truth, beside the lower bound for any method."""
 
 import argparse
 import sys
@@ -20,8 +14,7 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
 from psd_deflection.rig.config import Rig, load_rig
 
-SETTLED_S = 10.0
-"""Time after the load step when the modes have decayed."""
+SETTLED_S = 10.0  # Time after the load step when the modes have decayed.
 
 CASES = {'unloaded': (0.0, 0.0, 0.0)}
 CASES |= {f'{f:g} N on the sidebar': sidebar(f) for f in (10.0, 30.0, 50.0)}

@@ -1,16 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The bits of a recording on other processors: ``make bits``; under a minute on two cores.
-
-The golden recordings are recorded again and replayed in processes that are told to compute as
-other processors would: four kernels of OpenBLAS, numpy with less and less of the instructions that this processor has,
-and the C library without fused multiply-add. What each setting recorded is replayed under each other one. The table
-counts the messages that differ. Ends with status 1 if one does.
-
-A kernel that this processor cannot run is left out, and said.
-"""
-
-from __future__ import annotations
+"""The bits of a recording on other processors: ``make bits``; under a minute on two cores."""
 
 import argparse
 import concurrent.futures

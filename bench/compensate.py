@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make demo NAME=compensate``: a simulated arm of two links with and without compensation and shapers, on one page.
-
-The arm of ``config/two_links.yaml`` takes up a payload, moves, loses its estimates for half a second, and puts the
-payload down. The estimates have noise and come 30 ms late. Each run is half a minute of the arm's time.
-"""
-
-from __future__ import annotations
+"""``make demo NAME=compensate``: a simulated arm of two links with and without compensation and shapers, on one
+page."""
 
 import argparse
 import collections
@@ -32,8 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 URDF = ROOT / 'config' / 'two_links.urdf'
 PERIOD = 0.02
 LATE = 0.03
-NOISE = 1e-6
-"""Of a deflection, m, one standard deviation."""
+NOISE = 1e-6  # Of a deflection, m, one standard deviation.
 
 PAYLOAD = np.array([0.0, 0.0, -20.0])
 TAKEN, MOVED, ARRIVED, LOST, BACK, ENABLED, PUT_DOWN, END = 1.0, 8.0, 11.0, 16.0, 16.5, 3.0, 20.0, 26.0
@@ -105,13 +99,7 @@ def rms(ran: Ran, window: tuple[float, float]) -> float:
 
 def chart(without: Ran, ran: Ran) -> Chart:
     """Errors and offsets over time."""
-    events = (
-        (TAKEN, 'payload'),
-        (ENABLED, 'enabled'),
-        (MOVED, 'move'),
-        (LOST, 'no estimates'),
-        (PUT_DOWN, 'put down'),
-    )
+    events = ((TAKEN, 'payload'), (ENABLED, 'enabled'), (MOVED, 'move'), (LOST, 'no estimates'), (PUT_DOWN, 'put down'))
     rules = [Rule(t, what) for t, what in events]
     errors = (
         Series('without', without.t, without.error * 1e3, 'quiet'),

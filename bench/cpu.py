@@ -1,29 +1,12 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where the CPU time of the live node goes: by thread and part of the program, and by kind of native code.
-
-    python -m bench.cpu [--seconds 20] [--no-native]
-
-The node runs with its defaults and records. Two windows follow each other:
-
-- *Parts.* The functions of ``PARTS`` are measured by the CPU clock of their thread, each without those
-  inside it; the kernel says what each thread took in all. What belongs to no part is the rest of its
-  thread: waking up, waiting, loops. Clocks of threads stand still while others run, so that load from
-  outside changes the shares little.
-- *Native.* ``perf`` (if it is installed and permitted) samples the running threads, with the clocks in
-  them. Each sample belongs to the first kind of ``KINDS`` that one of its callers is of.
-
-The table goes into ``bench/cpu.json``, of which docs/performance.md is made.
-"""
-
-from __future__ import annotations
+"""Where the CPU time of the live node goes: by thread and part of the program."""
 
 import gc
 import importlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -40,12 +23,9 @@ from bench.rows import ROOT, Row, figure, keep
 from blind.campaign import conclude, options
 
 RESULTS = ROOT / 'bench' / 'cpu.json'
-SETTLE_BLOCKS = 250
-"""Five seconds of blocks: what is imported and made at the start is over."""
-PATIENCE_S = 300.0
-"""Longest time until the node runs, s."""
-ENOUGH = 0.98
-"""Least share of the blocks that a node gets through which is not held up by others."""
+SETTLE_BLOCKS = 250  # Five seconds of blocks: what is imported and made at the start is over.
+PATIENCE_S = 300.0  # Longest time until the node runs, s.
+ENOUGH = 0.98  # Least share of the blocks that a node gets through which is not held up by others.
 
 PARTS = {
     'port: select and read': ('devices.port:DescriptorPort.read',),
@@ -87,21 +67,6 @@ PARTS = {
 """By its name: functions of the package, ``module:name``. The self time of each is its part's."""
 COLLECTION = 'garbage collection'
 REST = 'rest: waking up, waiting, loops'
-
-KINDS = (
-    ('rclpy, rmw, DDS', r'rclpy|librcl|librmw|fastdds|fastrtps|fastcdr|rosidl|libtracetools'),
-    ('MCAP: zstd, CRC', r'zstd|zstandard|libz\.so'),
-    ('numpy', r'_multiarray_umath|numpy|pocketfft|openblas'),
-    ('scipy', r'scipy'),
-    ('garbage collection', r'gc_collect|deduce_unreachable|visit_reachable|subtract_refs'),
-    (
-        'waking up: locks, sleep, select, queue',
-        r'take_gil|drop_gil|PyThread_acquire|futex|sem_|pthread_cond|nanosleep|select|poll|schedule',
-    ),
-    ('kernel: read, write, fsync, page faults, interrupts', r'kernel\.kallsyms'),
-    ("Python's interpreter and objects", r'python|libc\.so|ld-linux|libm\.so|_struct|\[vdso\]'),
-)
-"""Native code, from what is most telling to what is least: a frame's function and library."""
 
 
 def resolve(place: str) -> tuple[Any, str, Callable[..., Any]]:
@@ -231,33 +196,8 @@ def parts(reported: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float
     return found, reported['took'], calls * reported['cost'] / 1e9 / sum(found.values())
 
 
-def kind_of(frames: list[str]) -> str:
-    """The kind of a sample by its ``frames``, the innermost first, each with its function and library."""
-    for name, pattern in KINDS[:-2]:
-        if any(re.search(pattern, frame) for frame in frames):
-            return name
-    return next((name for name, pattern in KINDS[-2:] if frames and re.search(pattern, frames[0])), 'not known')
-
-
-def native(pid: int, seconds: float) -> Counter[str]:
-    """Samples of each kind of native code in ``seconds`` of the process ``pid``; none if perf cannot."""
-    if shutil.which('perf') is None:
-        return Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        data = f'{folder}/perf.data'
-        record = ['perf', 'record', '-e', 'cpu-clock', '-F', '999', '--call-graph', 'dwarf,16384', '-o', data]
-        done = subprocess.run([*record, '-p', str(pid), '--', 'sleep', f'{seconds:g}'], capture_output=True, text=True)
-        if done.returncode:
-            print(f'perf: {done.stderr.strip().splitlines()[-1]}', file=sys.stderr)
-            return Counter()
-        script = ['perf', 'script', '-i', data, '--no-inline', '-F', 'ip,sym,dso']
-        text = subprocess.run(script, capture_output=True, text=True).stdout
-    samples = [block.split('\n') for block in map(str.strip, text.split('\n\n')) if block]
-    return Counter(kind_of(frames) for frames in samples)
-
-
-def measure(seconds: float, with_perf: bool) -> tuple[dict[tuple[str, str], float], float, float, Counter[str]]:
-    """Run the node on a device of its own; what :func:`parts` and :func:`native` say of it."""
+def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]:
+    """Run the node on a device of its own; what :func:`parts` says of it."""
     device = Device()
     device.thread.start()
     with tempfile.TemporaryDirectory() as folder:
@@ -272,7 +212,6 @@ def measure(seconds: float, with_perf: bool) -> tuple[dict[tuple[str, str], floa
         try:
             if not line:
                 raise SystemExit('bench.cpu: the node ended before it was measured')
-            found = native(child.pid, seconds) if with_perf else Counter()
         finally:
             timer.cancel()
             child.send_signal(signal.SIGTERM)
@@ -286,46 +225,38 @@ def measure(seconds: float, with_perf: bool) -> tuple[dict[tuple[str, str], floa
             f'and the parts of the threads that wait for them come out too small',
             file=sys.stderr,
         )
-    return (*parts(reported), found)
+    return parts(reported)
 
 
-def rows_of(spent: dict[tuple[str, str], float], took: float, clocks: float, samples: Counter[str]) -> list[Row]:
-    """The tables: shares of the node's CPU, %, the largest first."""
+def row_of(spent: dict[tuple[str, str], float], took: float, clocks: float) -> Row:
+    """The table: shares of the node's CPU, %, the largest first."""
     total = sum(spent.values())
     threads: defaultdict[str, float] = defaultdict(float)
     for (thread, _), s in spent.items():
         threads[thread] += s
     share = f'{100.0 * total / took:.1f} % of a core, clocks {100.0 * clocks:.0f} % of it'
-    rows = [Row(f'CPU of the node by part: {share}', '%')]
+    row = Row(f'CPU of the node by part: {share}', '%')
     for thread in sorted(threads, key=threads.__getitem__, reverse=True):
         for (one, part), s in sorted(spent.items(), key=lambda item: -item[1]):
             if one == thread and s >= 0.001 * total:
-                rows[0].figures.append(figure(f'{thread}: {part}', 'ours', [100.0 * s / total]))
-    if samples:
-        kinds = Row(f'CPU of the node by native code: {samples.total()} samples of perf', '%')
-        kinds.figures += [figure(k, 'ours', [100.0 * n / samples.total()]) for k, n in samples.most_common()]
-        rows.append(kinds)
-    return rows
+                row.figures.append(figure(f'{thread}: {part}', 'ours', [100.0 * s / total]))
+    return row
 
 
 def main() -> int:
     """Measure, print and keep."""
     parser = options(__doc__)
     parser.add_argument('--seconds', type=float, default=20.0, help='of each window (default: 20)')
-    parser.add_argument('--no-native', action='store_true', help='without perf')
     parser.add_argument('--results', type=Path, default=RESULTS)
     parser.add_argument('--node', help='of the child process: the port')
     parser.add_argument('--folder', help='of the child process: where it records')
     args = parser.parse_args()
     if args.node:
         return node(args.node, args.folder, args.seconds)
-    rows = rows_of(*measure(args.seconds, not args.no_native))
+    row = row_of(*measure(args.seconds))
     args.results.unlink(missing_ok=True)
-    keep(rows, args.results)
-    lines = []
-    for row in rows:
-        lines += [row.work, *(f'  {f.median:5.1f} %  {f.name}' for f in row.figures)]
-    return conclude('\n'.join(lines))
+    keep([row], args.results)
+    return conclude('\n'.join([row.work, *(f'  {f.median:5.1f} %  {f.name}' for f in row.figures)]))
 
 
 if __name__ == '__main__':

@@ -1,16 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Times from ``make run`` until the page is served, shows the dots, and the dots move.
-
-    python -m bench.first_look [--times 3]
-
-The clock starts with ``make run``, in an environment that is set up, with a browser that is open already;
-the dots have moved once the simulated rig's first weight shows (0.1 mm on PSD 1). Besides, from the request of the
-page on: what the first load fetches and until when, when the first trace is drawn, and what that costs the page's
-thread (which, unlike the times, depends little on what else the machine does). Needs Chromium and its driver.
-"""
-
-from __future__ import annotations
+"""Times from ``make run`` until the page is served, shows the dots, and the dots move."""
 
 import argparse
 import subprocess

@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make bench``, without a live line: frames, replay, conversion, simulation, discover beside peers and limits.
-
-    python -m bench.limits [--only frames] [--minutes 10] [--times 5]
-
-A peer is what a user would write with known libraries; a limit is the least that any program must do. All are measured
-in turns in this process and kept in ``bench/results.json``, from which ``python -m bench.page`` makes
-docs/performance.md.
-"""
-
-from __future__ import annotations
+"""``make bench``, without a live line: frames, replay, conversion, simulation, discover beside peers and limits."""
 
 import argparse
 import contextlib
@@ -55,8 +46,7 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.from_recordings import read_observation
 
-READ_FRAMES = 18
-"""Frames of one read: the reader waits until a block is nearly whole."""
+READ_FRAMES = 18  # Frames of one read: the reader waits until a block is nearly whole.
 
 TEN = (
     'clamp_bending_compliance,compliance=1e-4',
@@ -388,13 +378,13 @@ def searched(
     return row
 
 
-def used_by(checkout: Path, *arguments: str) -> tuple[float, float]:
-    """(s, MB): time and most memory of the command ``psd-deflection`` of ``checkout``."""
+def used_by(*arguments: str) -> tuple[float, float]:
+    """(s, MB): time and most memory of the command ``psd-deflection``."""
     command = [sys.executable, '-c', _REPORTS_MEMORY, *arguments]
     began = time.perf_counter()
-    done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f'psd-deflection {" ".join(arguments)} in {checkout}: {done.stderr.strip()}')
+        raise SystemExit(f'psd-deflection {" ".join(arguments)}: {done.stderr.strip()}')
     return time.perf_counter() - began, float(done.stdout.split()[-1]) / 1024
 
 
@@ -407,29 +397,22 @@ runpy.run_module('psd_deflection', run_name='__main__', alter_sys=True)
 """Runs the command and ends with its largest memory, KiB."""
 
 
-def verdicts(times: int, checkout: Path | None) -> list[Row]:
-    """The command ``discover`` from start to report, on CSV files of one effect; beside that of ``checkout``."""
+def verdicts(times: int) -> list[Row]:
+    """The command ``discover`` from start to report, on CSV files of one effect."""
     rows = []
-    versions = [('psd-deflection discover', 'ours', ROOT), *([('of --checkout', 'peer', checkout)] if checkout else [])]
     with tempfile.TemporaryDirectory() as folder:
         for repeats in (1, 4, 10):
-            table = Path(folder) / f'{repeats}.csv'
+            table = f'{folder}/{repeats}.csv'
             loads = ['--loads', 'identification'] * repeats
-            effect = SEARCHES[0][1][0]
-            used_by(ROOT, 'simulate', '--out', str(table), *loads, '--effect', effect, '--seed', '5')
+            used_by('simulate', '--out', table, *loads, '--effect', SEARCHES[0][1][0], '--seed', '5')
             lasts = len(load_history('identification', 1000.0).loads) * repeats / 1000.0
-            used: dict[str, list[tuple[float, float]]] = {name: [] for name, _, _ in versions}
-            for _ in range(times):
-                for name, _, where in versions:
-                    used[name].append(used_by(where, 'discover', str(table), '--out', f'{folder}/found'))
-            for what, unit, i in (('from start to report', 's', 0), ('memory', 'MB', 1)):
-                work = f'discover, {lasts:g} s in a CSV, one effect: {what}'
-                figures = [
-                    figure(n, kind, [u[i] for u in used[n]], 1.0 if i == 0 and kind == 'peer' else None)
-                    for n, kind, _ in versions
-                ]
-                rows.append(Row(work, unit, figures))
-            rows[-2].figures.append(figure('what its recording lasts', 'limit', [lasts], 1.0))
+            seconds, memory = zip(
+                *(used_by('discover', table, '--out', f'{folder}/found') for _ in range(times)), strict=True
+            )
+            work, name = f'discover, {lasts:g} s in a CSV, one effect', 'psd-deflection discover'
+            limit = figure('what its recording lasts', 'limit', [lasts], 1.0)
+            rows.append(Row(f'{work}: from start to report', 's', [figure(name, 'ours', seconds), limit]))
+            rows.append(Row(f'{work}: memory', 'MB', [figure(name, 'ours', memory)]))
     return rows
 
 
@@ -440,7 +423,6 @@ def main() -> int:
     parser.add_argument('--seconds', type=float, default=60.0, help='of the recording that discover gets')
     parser.add_argument('--times', type=int, default=5)
     parser.add_argument('--only', choices=('frames', 'replay', 'conversion', 'simulation', 'discover', 'verdict'))
-    parser.add_argument('--checkout', type=Path, help='another version of this repository, whose verdict is timed too')
     parser.add_argument('--results', type=Path, default=RESULTS)
     args = parser.parse_args()
     jobs: dict[str, Callable[[], list[Row]]] = {
@@ -449,7 +431,7 @@ def main() -> int:
         'conversion': lambda: conversion(args.times, args.minutes),
         'simulation': lambda: simulation(args.times),
         'discover': lambda: search(args.times // 2, args.seconds),
-        'verdict': lambda: verdicts(max(1, args.times // 2), args.checkout),
+        'verdict': lambda: verdicts(max(1, args.times // 2)),
     }
     for name, job in jobs.items():
         if args.only in (None, name):

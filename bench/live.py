@@ -1,22 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make bench``, the live path: its cost beside the minimum that ROS and MCAP allow.
-
-Every figure stands beside a peer's from the same run, as a ratio: machines differ and are shared.
-
-- Latency: last byte of a block written to the port -> callback in another process, beside a bare
-  publisher of the same message -> the same callback, both in the same subscriber at the same time.
-- The same with the live page open, in turns with the node alone.
-- CPU: the node with recording, as a share of one core, beside the sum of its bare parts.
-- Start: from the command to the first estimate that another process hears, beside a bare publisher's.
-
-The rows go into ``bench/results.json``, unless the node is that of ``--checkout``, another version of this repository:
-
-    python -m bench.live --checkout ../before --starts 0
-    python -m bench.live --parameters consistency:=report --starts 0
-"""
-
-from __future__ import annotations
+"""``make bench``, the live path: its cost beside the minimum that ROS and MCAP allow."""
 
 import argparse
 import asyncio
@@ -28,10 +12,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -39,8 +22,7 @@ import numpy.typing as npt
 from bench.rows import RESULTS, ROOT, Row, figure, keep, notify
 
 BLOCKS_PER_S = 50
-START_S = 4.0
-"""A process has imported rclpy and found the others."""
+START_S = 4.0  # A process has imported rclpy and found the others.
 
 
 def until_stdin_closes() -> threading.Event:
@@ -276,27 +258,19 @@ class Latencies:
     shares: list[float] = field(default_factory=list)
 
 
-class Node(NamedTuple):
-    """The node that is measured: ``checkout`` has its code; its ``parameters`` are ``name:=value``."""
-
-    checkout: Path = ROOT
-    parameters: Sequence[str] = ()
-
-    def begin(self, port: str, *options: str, page: bool = False) -> subprocess.Popen[str]:
-        """Start it on ``port``; ``page``: it serves the live page too, on a port that is free."""
-        parameters = [*self.parameters, *(['monitor_port:=0'] if page else [])]
-        command = [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', port, *options]
-        command += ['--monitor'] if page else []
-        command += ['--ros-args', *(word for value in parameters for word in ('-p', value))] if parameters else []
-        return subprocess.Popen(command, cwd=self.checkout, stderr=subprocess.PIPE, text=True)
+def begin(port: str, *options: str, page: bool = False) -> subprocess.Popen[str]:
+    """Start the node on ``port``; ``page``: it serves the live page too, on a port that is free."""
+    more = ['--monitor', '--ros-args', '-p', 'monitor_port:=0'] if page else []
+    command = [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', port, *options, *more]
+    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
 
 
-def measure(node_of: Node, seconds: float, settle: float, page: bool, into: Latencies) -> None:
+def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
     """One node, recording; ``page``: it serves the live page too, and a browser's worth of it is fetched."""
     device = Device()
     device.thread.start()
     with tempfile.TemporaryDirectory() as folder:
-        node = node_of.begin(device.port.name, '--record', folder, page=page)
+        node = begin(device.port.name, '--record', folder, page=page)
         assert node.stderr is not None
         url = next(line.split()[1] for line in node.stderr if line.startswith('monitor: ')) if page else ''
         # Its further output is read and ignored.
@@ -334,12 +308,12 @@ def measure(node_of: Node, seconds: float, settle: float, page: bool, into: Late
             into.ours.append((t - int(last[-1])) / 1e6)
 
 
-def live(node: Node, seconds: float, settle: float, rounds: int) -> list[Row]:
+def live(seconds: float, settle: float, rounds: int) -> list[Row]:
     """The node alone and the node with the live page, in turns, each beside a bare publisher."""
     alone, with_page = Latencies(), Latencies()
     for _ in range(rounds):
-        measure(node, seconds / rounds, settle, False, alone)
-        measure(node, seconds / rounds, settle, True, with_page)
+        measure(seconds / rounds, settle, False, alone)
+        measure(seconds / rounds, settle, True, with_page)
     return live_rows(alone, with_page, parts(seconds / rounds, rounds))
 
 
@@ -368,7 +342,7 @@ def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
     return path, n
 
 
-def start(node_of: Node, times: int) -> Row:
+def start(times: int) -> Row:
     """From the command to the first callback in a process that listens already; the limit is a bare publisher's."""
     seconds: dict[str, list[float]] = {'/link_tip/deflection': [], '/bare': []}
     for _ in range(times):
@@ -382,7 +356,7 @@ def start(node_of: Node, times: int) -> Row:
         bare = child('bare')
         time.sleep(START_S)
         began['/link_tip/deflection'] = time.monotonic_ns()
-        node = node_of.begin(device.port.name)
+        node = begin(device.port.name)
         assert node.stderr is not None
         threading.Thread(target=node.stderr.read, daemon=True).start()
         assert subscriber.stdout is not None
@@ -448,10 +422,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement of each kind of node')
     parser.add_argument('--starts', type=int, default=5, help='times that the start is measured; 0: not at all')
-    parser.add_argument(
-        '--checkout', type=Path, default=ROOT, help='another version of this repository, whose node runs'
-    )
-    parser.add_argument('--parameters', nargs='+', default=(), metavar='NAME:=VALUE', help='of the node')
     parser.add_argument('--results', type=Path, default=RESULTS)
     parser.add_argument('--settle', type=float, default=5.0, help='seconds before each measurement')
     parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
@@ -469,14 +439,12 @@ def main() -> int:
     if args.role:
         roles[args.role]()
     else:
-        node = Node(args.checkout.resolve(), args.parameters)
-        rows = live(node, args.seconds, args.settle, args.rounds)
+        rows = live(args.seconds, args.settle, args.rounds)
         if args.starts:
-            rows.append(start(node, args.starts))
+            rows.append(start(args.starts))
         for row in rows:
             notify(row)
-        if node == Node():
-            keep(rows, args.results)
+        keep(rows, args.results)
     return 0
 
 

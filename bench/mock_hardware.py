@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Compensator and shaper with the real controllers of ros2_control, on hardware that is mock_components/GenericSystem.
-
-  python3 -m bench.mock_hardware
-
-It wants ROS 2 from apt with ros-jazzy-ros2-control and ros-jazzy-ros2-controllers; the workflow has them. First the
-shaper moves the arm by joint_trajectory_controller, with trajectories that replace each other, and then by its action,
-with goals that replace each other, one that is cancelled and one that cannot be. Then the compensator drives
-forward_position_controller with sums, while a simulated arm bends. Judged are the steps of the joints.
-"""
+"""Compensator and shaper with the real controllers of ros2_control, on hardware that is
+mock_components/GenericSystem."""
 
 from __future__ import annotations
 
@@ -42,10 +35,8 @@ NAMES = ('shoulder', 'elbow')
 PERIOD_S = 0.02
 NOISE = 1e-6
 LONGEST_S = 60.0
-FASTEST = 4.0
-"""Bound of the shaped motion, rad/s: it goes at most 0.4 rad in 0.4 s, from a motion of as much."""
-STATES_S = 0.002
-"""Time between two messages of the joints."""
+FASTEST = 4.0  # Bound of the shaped motion, rad/s: it goes at most 0.4 rad in 0.4 s, from a motion of as much.
+STATES_S = 0.002  # Time between two messages of the joints.
 
 
 class Arm:

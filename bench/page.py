@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes docs/performance.md, and three rows of README, from bench/results.json and bench/cpu.json.
-
-``python -m bench.page`` is the last step of ``make bench ARGS=--full``.
-"""
-
-from __future__ import annotations
+"""Makes docs/performance.md, and three rows of README, from bench/results.json and bench/cpu.json."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,10 +12,8 @@ from bench.rows import RESULTS, ROOT, Figure, Row, read
 TEMPLATE = ROOT / 'bench' / 'performance_template.md'
 PAGE = ROOT / 'docs' / 'performance.md'
 README = ROOT / 'README.md'
-PRINTED_BY = '| `make bench ARGS=--full` |'
-"""How the rows of README end that are made here."""
-SMALL = 2.0
-"""Per cent of the CPU, below which parts are added up."""
+PRINTED_BY = '| `make bench ARGS=--full` |'  # How the rows of README end that are made here.
+SMALL = 2.0  # Per cent of the CPU, below which parts are added up.
 
 
 def cell(f: Figure, unit: str = '') -> str:
@@ -57,26 +50,20 @@ def measured(machine: Mapping[str, Any]) -> str:
     )
 
 
-def shares(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
+def shares(row: Row, machine: Mapping[str, Any]) -> str:
     """What :mod:`bench.cpu` measured: a row for each thread."""
     lines = [
-        f'{machine["date"]}, commit {machine["commit"]}, {machine["processor"]}, load {machine["load"]} at the end.'
+        f'{machine["date"]}, commit {machine["commit"]}, {machine["processor"]}, load {machine["load"]} at the end.',
+        *('', f'| {row.work} | {row.unit} |', '|---|---|'),
     ]
-    for row in rows:
-        lines += ['', f'| {row.work} | {row.unit} |', '|---|---|']
-        threads: dict[str, list[str]] = {}
-        small = 0.0
-        for f in row.figures:
-            thread, colon, part = f.name.partition(': ')
-            if f.median < SMALL:
-                small += f.median
-            elif row is rows[0] and colon:
-                threads.setdefault(thread, []).append(f'{part} {f.median:.1f}')
-            else:
-                threads[f.name] = [f'{f.median:.1f}']
-        lines += [f'| {thread} | {"; ".join(parts)} |' for thread, parts in threads.items()]
-        lines += [f'| parts below {SMALL:g} % | {small:.1f} |'] if small else []
-    return '\n'.join(lines)
+    threads: dict[str, list[str]] = {}
+    for f in row.figures:
+        if f.median >= SMALL:
+            thread, _, part = f.name.partition(': ')
+            threads.setdefault(thread, []).append(f'{part} {f.median:.1f}')
+    lines += [f'| {thread} | {"; ".join(parts)} |' for thread, parts in threads.items()]
+    small = sum(f.median for f in row.figures if f.median < SMALL)
+    return '\n'.join([*lines, f'| parts below {SMALL:g} % | {small:.1f} |'])
 
 
 def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cpu_machine: Mapping[str, Any]) -> str:
@@ -86,7 +73,7 @@ def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cp
         table += lines_of(row)
     text = TEMPLATE.read_text(encoding='utf-8')
     text = text.replace('<!-- machine -->', measured(machine)).replace('<!-- table -->', '\n'.join(table))
-    return text.replace('<!-- cpu -->', shares(cpu, cpu_machine))
+    return text.replace('<!-- cpu -->', shares(cpu[0], cpu_machine))
 
 
 def readme(text: str, rows: Sequence[Row]) -> str:

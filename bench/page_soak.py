@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The live page left open on a live daemon: its heap every minute (``make campaign NAME=page-soak``).
-
-Starts a daemon on the simulated rig (``--no-ros``) and headless Chromium on its page. The heap is read after a
-collection of garbage, with the number of DOM nodes, and written to a CSV file, so that a run that is stopped leaves
-what it saw. Ends with status 1 if the heap from the fifth minute on spans more than 200 kB.
-
-``--rate`` makes the device sample faster, so that the page gets more blocks a second: 4 for 200 instead of 50.
-"""
-
-from __future__ import annotations
+"""The live page left open on a live daemon: its heap every minute (``make campaign NAME=page-soak``)."""
 
 import csv
 import re

@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How many rigs at 1 kHz one process on one core takes without a lost sample: the curve of its CPU time.
-
-    python -m bench.rigs [--most 64] [--seconds 10]
-
-A second process sends the frames of all devices over pseudo-terminals, on the other cores. The sessions are those of
-the daemon without ROS and without recording: reader, pipeline with all solvers, fan-out.
-"""
-
-from __future__ import annotations
+"""How many rigs at 1 kHz one process on one core takes without a lost sample: the curve of its CPU time."""
 
 import argparse
 import json

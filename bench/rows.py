@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the benchmarks find: rows of ours, peers and limits, measured in turns, kept in ``bench/results.json``."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import os
@@ -24,17 +22,14 @@ RESULTS = ROOT / 'bench' / 'results.json'
 PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas', 'rosbags')
 
 
-STEADY = 0.25
-"""Quartiles that are further apart than this share of their median: load from outside shows in them."""
+STEADY = 0.25  # Quartiles that are further apart than this share of their median: load from outside shows in them.
 
 
 @dataclass
 class Figure:
-    """One thing measured several times. ``kind``: ours, peer or limit.
-
-    The ratio of a peer is how many times as fast ours is (``bound``: at least), of a limit how many times as much ours
-    takes (at most). ``bound`` of ours is what it must reach itself. None: there is none.
-    """
+    """One thing measured several times. ``kind``: ours, peer or limit. The ratio of a peer is how many times as fast
+    ours is (``bound``: at least), of a limit how many times as much ours takes (at most). ``bound`` of ours is what it
+    must reach itself. None: there is none."""
 
     name: str
     kind: str
@@ -87,15 +82,12 @@ def figure(name: str, kind: str, values: npt.ArrayLike, bound: float | None = No
     return Figure(name, kind, middle, low, high, np.size(values), bound)
 
 
-Job = tuple[str, str, Callable[[], object], float | None]
-"""Name, kind, what to time, bound."""
+Job = tuple[str, str, Callable[[], object], float | None]  # Name, kind, what to time, bound.
 
 
 def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
-    """Time each of ``jobs`` ``times`` times, one after the other and again, so that a busy moment meets all.
-
-    ``scale``: from s to ``unit``.
-    """
+    """Time each of ``jobs`` ``times`` times, one after the other and again, so that a busy moment meets all. ``scale``:
+    from s to ``unit``."""
     seconds: list[list[float]] = [[] for _ in jobs]
     for _ in range(times):
         for (_, _, job, _), taken in zip(jobs, seconds, strict=True):

@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What shapers leave of a vibration: ``python -m bench.shapers``.
-
-Shapers: the arm of ``config/two_links.yaml`` carries 20 N and moves both joints within 0.4 s. Its links ring at 12 Hz.
-The shapers are made for that frequency, and for one that is 5 % below or above. Judged is the amplitude when the joints
-have arrived.
-"""
-
-from __future__ import annotations
+"""What shapers leave of a vibration: ``python -m bench.shapers``."""
 
 import functools
 from collections.abc import Sequence
@@ -28,10 +21,8 @@ NAMES = ('shoulder', 'elbow')
 START, END = np.array([1.2, 0.6]), np.array([0.9, 1.0])
 MOVE_S = 0.4
 STEP_S = 0.002
-SETTLED_S = 6.0 * LAG_S
-"""After the last point the joints have arrived, s."""
-WRONG = (0.95, 1.0, 1.05)
-"""The frequency that the shaper is made for, over the true one."""
+SETTLED_S = 6.0 * LAG_S  # After the last point the joints have arrived, s.
+WRONG = (0.95, 1.0, 1.05)  # The frequency that the shaper is made for, over the true one.
 
 
 def move() -> Trajectory:

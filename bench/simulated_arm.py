@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An arm whose links bend under a load at its end: what the compensator and the shaper are tried on.
-
-The links bend as ``chains`` composes them, statically, and swing about that as one damped mode. The joints follow
-their commands with a lag of first order. A mass at the end loads the links by its inertia too.
-"""
-
-from __future__ import annotations
+"""An arm whose links bend under a load at its end: what the compensator and the shaper are tried on."""
 
 import math
 
@@ -15,18 +9,15 @@ import numpy as np
 from psd_deflection.arms.chains.chain import Chain, EndEffector, TipDeflection
 from psd_deflection.records import FloatArray
 
-LAG_S = 0.02
-"""Time constant of the joints."""
+LAG_S = 0.02  # Time constant of the joints.
 
 _CERTAIN = np.zeros((3, 3))
 
 
 class SimulatedArm:
     """``chain``: the links; ``angles``: of its joints at the start, rad; ``frequency`` Hz and ``damping`` of the mode.
-
     ``force`` (3,): the load at the end effector, N in the base. ``angles``: where the joints are now. ``mass``, kg, at
-    the end effector: only its inertia, as of the rigid arm.
-    """
+    the end effector: only its inertia, as of the rigid arm."""
 
     def __init__(
         self, chain: Chain, angles: FloatArray, frequency: float = 12.0, damping: float = 0.01, mass: float = 0.0

@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the solvers, beside their peers in the same run: ``python bench/solvers.py``.
-
-Ratios depend less on the machine than times do. A peer's rate is measured on fewer blocks, enough for a
-tenth of a second or more.
-"""
-
-from __future__ import annotations
+"""Speed of the solvers, beside their peers in the same run: ``python bench/solvers.py``."""
 
 import argparse
 import functools

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one criterion for whatever moves an arm: no step between two commands is larger than its rate times the time."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 
@@ -14,9 +12,7 @@ from psd_deflection.records import FloatArray
 
 def largest_step(stamps: Sequence[float], commands: Sequence[FloatArray], max_rate: float) -> float:
     """The largest step over ``max_rate`` times the time between the two, 1 at most if all is well; 0 of fewer than two.
-
-    ``stamps`` (n,): when ``commands`` (n, joints) were sent, s. Infinite if one is not finite or time stands still.
-    """
+    ``stamps`` (n,): when ``commands`` (n, joints) were sent, s. Infinite if one is not finite or time stands still."""
     if len(commands) < 2:
         return 0.0
     sent = np.array(commands)

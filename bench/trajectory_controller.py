@@ -1,16 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What joint_trajectory_controller does with the trajectories that it gets, on a clock of the caller's.
-
-Its rules, as of ros2_controllers for Jazzy: a stamp of 0 begins when the trajectory arrives, another at that time.
-Until its first point it goes there from where the command is on arrival. After that it follows it, also from its
-middle. After the last point it stays. The joints are where they are commanded. Times that do not rise are rejected.
-
-As an action: a goal that is taken ends the one before it (aborted, INVALID_GOAL). A cancelled one ends at once, and the
-joints are held where they are. A goal has succeeded when its last point is over. Feedback comes 20 times a second.
-"""
-
-from __future__ import annotations
+"""What joint_trajectory_controller does with the trajectories that it gets, on a clock of the caller's."""
 
 import time
 from collections.abc import Sequence
@@ -72,11 +62,9 @@ class TrajectoryController:
 
 
 class ServedController:
-    """``controller`` as the action ``name`` of a node that somebody spins, on the system's clock.
-
-    ``rejects``: it takes no goal. ``mute``: it says nothing more of a goal that it has taken. ``goals``: those that it
-    has been asked. ``late``: how many came after they should have begun.
-    """
+    """``controller`` as the action ``name`` of a node that somebody spins, on the system's clock. ``rejects``: it takes
+    no goal. ``mute``: it says nothing more of a goal that it has taken. ``goals``: those that it has been asked.
+    ``late``: how many came after they should have begun."""
 
     def __init__(self, node: Any, names: Sequence[str], controller: TrajectoryController, name: str = ACTION) -> None:
         # The stand-in itself needs no ROS.

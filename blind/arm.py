@@ -1,21 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A two-link flexible arm: a plant for ``discover_in``.
-
-The data are nine steps measured by others (repository basta/quanser-2-dof-serial-flexible-link, MIT licence).
-
-Stage 1 of the arm: a geared motor turns a hub, and a flexible link carries the rest. The equations
-of motion are (hub angle h, tip angle against the hub d, motor current u)::
-
-    J1 h'' = Ks d - B1 h' + B2 d' - T(h') + Kt u
-    d'' = -(1/J1 + 1/J2)(Ks d + B2 d') + (B1 h' + T(h') - Kt u)/J1
-
-The maker's model has B2 = 0 and no Coulomb friction T. Each measured step is simulated from its first
-state with the current that the arm's controller commanded: the linear-quadratic gain of the nominal
-model applied to the recorded states. A closed loop would hide many of the model's errors.
-"""
-
-from __future__ import annotations
+"""A two-link flexible arm: a plant for ``discover_in``."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -29,8 +14,7 @@ from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 RATE = 100.0
 SUBSTEPS = 8
-CREEP_RATE = 0.02
-"""Hub rate, rad/s, below which Coulomb friction fades: a sign function would stop any integrator."""
+CREEP_RATE = 0.02  # Hub rate, rad/s, below which Coulomb friction fades: a sign function would stop any integrator.
 
 KS = 2.068427e11 * (3.0 * 0.0254) * (0.050 * 0.0254) ** 3 / (4.0 * 0.202)
 B1 = 4.0

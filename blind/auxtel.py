@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Pointing of an altazimuth telescope, 44 stars of one night: a plant for ``discover_in``.
-
-The data are those of Rubin's auxiliary telescope, 2020-03-14 (technical note TSTN-014, CC-BY-4.0): azimuth and
-elevation as commanded and as seen. Its makers fitted them with TPOINT, which names the terms: IA and IE are zeros of
-the two encoders, CA the collimation, NPAE the angle between the axes, AN and AW the tilt of the azimuth axis to north
-and west, TF and TX flexure of the tube; the rest are harmonics, H, then what they correct (A azimuth, E elevation,
-S across on the sky), then sine or cosine, of A or E, and their order.
-"""
-
-from __future__ import annotations
+"""Pointing of an altazimuth telescope, 44 stars of one night: a plant for ``discover_in``."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -22,8 +13,7 @@ from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 ARCSECONDS = 3600.0 * 180.0 / np.pi
-HIGHEST = 8
-"""Order of a harmonic, at most."""
+HIGHEST = 8  # Order of a harmonic, at most.
 PHYSICAL = ('CA', 'NPAE', 'AN', 'AW', 'TF', 'TX')
 
 

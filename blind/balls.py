@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Balls that fall from a bridge, filmed: a plant for ``discover_in``.
-
-The data are those of de Silva and others 2020 (repository briandesilva/discovery-of-physics-from-data, MIT licence):
-two drops of each of nine balls, 15 heights a second. The first drops are searched, the second are the test. The model
-is free fall in vacuum. When a ball is let go is not known: a drop begins at its tenth height, with height and speed of
-a parabola through the heights around it. The balls of which no weight is written down are left out.
-"""
-
-from __future__ import annotations
+"""Balls that fall from a bridge, filmed: a plant for ``discover_in``."""
 
 import math
 import re
@@ -24,8 +16,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 FILE = 'Ball_drops_data.xls'
-GRAVITY, AIR = 9.81, 1.2
-"""m/s^2; kg/m^3."""
+GRAVITY, AIR = 9.81, 1.2  # m/s^2; kg/m^3.
 OUNCE = 0.0283495
 BALLS = {
     'Baseball': (5.0, 22.25),
@@ -40,12 +31,9 @@ BALLS = {
 }
 """Ounces and circumference, cm, as those who measured wrote down."""
 BEGIN, AROUND = 10, 6
-READING = 0.05
-"""m rms, of a height in a picture: their first heights, before the ball moves, differ by so much."""
-STEPS = 8
-"""Of the simulation between two heights."""
-UNEVEN = 5e-3
-"""s by which a step of time may differ from the usual; the record ends at the last that differs more."""
+READING = 0.05  # m rms, of a height in a picture: their first heights, before the ball moves, differ by so much.
+STEPS = 8  # Of the simulation between two heights.
+UNEVEN = 5e-3  # s by which a step of time may differ from the usual; the record ends at the last that differs more.
 SHEET = '{http://schemas.openxmlformats.org/spreadsheetml/2006/main}'
 
 LIBRARY = (
@@ -61,8 +49,7 @@ LIBRARY = (
 
 def read(path: Path) -> dict[str, FloatArray]:
     """Of each ball (n, 3): number of the drop, time (s), height (m). Raises OSError if there is no file, ValueError if
-    it is no such table.
-    """
+    it is no such table."""
     out = {}
     try:
         with ZipFile(path) as book:

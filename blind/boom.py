@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A telescoping cantilever boom under tip forces, read with a ruler: a plant for ``discover_in``.
-
-The data are measurements by others (repository StanleyWang1/GIRAF, 52 readings at eight lengths). Their nominal model
-is F L^3/(3 EI). The deflection counts from the reading at the shortest length without a force.
-"""
-
-from __future__ import annotations
+"""A telescoping cantilever boom under tip forces, read with a ruler: a plant for ``discover_in``."""
 
 import csv
 from collections.abc import Mapping
@@ -18,10 +12,8 @@ from psd_deflection.model.simulation.declaration import EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
-EI = 91.0
-"""N m^2, fitted by those who measured."""
-READING = 5e-4
-"""m rms, of a ruler with millimetres."""
+EI = 91.0  # N m^2, fitted by those who measured.
+READING = 5e-4  # m rms, of a ruler with millimetres.
 
 STIFFNESS = plant_effect(
     'bending_compliance',

@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of loads that a person hangs and notes: what hung there, what was noted, and which notes are wrong.
-
-Each design has its own weights and its own times; the name says the kind and the number: ``hand-late-7``.
-"""
-
-from __future__ import annotations
+"""Recordings of loads that a person hangs and notes: what hung there, what was noted, and which notes are wrong."""
 
 import functools
 import itertools
@@ -20,26 +15,21 @@ from blind.generator import RATE, Array
 KINDS = ('late', 'rounded', 'one', 'forgotten', 'mixed', 'twice', 'slow', 'unit', 'ms', 'cell', 'sway', 'near')
 """Each note another delay, late, or late and early; one load only; applied over up to a second; loads rounded to 5 N;
 one never noted; one noted as two; torque in another unit; all a few ms late; a load cell's noise; a swaying weight;
-each note some ms off, late or early.
-"""
-TORQUES = (9.80665, 0.0980665, 9.80665e-3, 1e-3, 1e-2)
-"""N m of each unit that a torque is noted in."""
-LEAST_S = 0.05
-"""A note that is less late than this is right."""
+each note some ms off, late or early."""
+TORQUES = (9.80665, 0.0980665, 9.80665e-3, 1e-3, 1e-2)  # N m of each unit that a torque is noted in.
+LEAST_S = 0.05  # A note that is less late than this is right.
 BESIDE_UNKNOWN_LOADS = (
     *('sensor_rotation', 'sensor_gain', 'axis_crosstalk', 'spot_clipping', 'mains_interference', 'damping'),
     *('laser_pointing_drift', 'thermal_drift', 'ambient_light'),
 )
 """Effects that a recording shows whatever hangs on the link."""
-CELL = (0.05, 0.05, 0.01)
-"""N, N, N m rms of a load cell."""
+CELL = (0.05, 0.05, 0.01)  # N, N, N m rms of a load cell.
 
 
 @dataclass(frozen=True, eq=False)
 class Hand:
     """``effective``, ``annotated`` (n, 3) N, N, N m. ``wrong``: what is to be told, one by one: its name, what is
-    right.
-    """
+    right."""
 
     effective: Array
     annotated: Array

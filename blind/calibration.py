@@ -1,26 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Whether calibrate tells the truth: rigs with random misalignments, made by :mod:`blind.misaligned`.
-
-    python -m blind.calibration --rigs 200 --jobs 2
-    python -m blind.calibration --rigs 40 --light
-    python -m blind.calibration --rigs 60 --unequal
-    python -m blind.calibration --rigs 200 --certificate
-
-Each rig is recorded with a reference (a camera of 30 frames a second), calibrated from the nominal rig file, and then
-measures another motion without a reference, with the zero taken anew. Compared with the truth: every parameter and
-its standard deviation, every published pose and its covariance, what is said to be undetermined with the Fisher
-information of this generator's own optics. Then the rig is recorded once more, half of them after one group of
-parameters moved by three tolerances, for ``calibrate --check``.
-
-``--unequal``: the parameters alone, of rigs whose channels have noise of 0.5 to 4 mV each, with a reference of 0.1, 1
-and 4 times the camera's noise.
-
-``--certificate``: does the U of a certificate cover the truth? The reference's scale is wrong by chance, and since the
-zero was taken the beams and the detectors have drifted by chance, as much as the certificate's inputs say.
-"""
-
-from __future__ import annotations
+"""Whether calibrate tells the truth: rigs with random misalignments, made by :mod:`blind.misaligned`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -50,8 +30,7 @@ from psd_deflection.studies.calibrate.result import result, values_of
 HOLDS, SECONDS = 24, 2.5
 AFTER, AFTER_SECONDS = 8, 1.5
 SIZE = 20
-BORDER = 0.04
-"""How far from the limit a share must be for the two Fisher informations to agree on its side."""
+BORDER = 0.04  # How far from the limit a share must be for the two Fisher informations to agree on its side.
 GROUPS = (
     'psd_1.rotation',
     'psd_2.rotation',
@@ -64,20 +43,16 @@ GROUPS = (
 )
 """Groups that are moved: a camera shows three tolerances of them."""
 Z95 = 1.959964
-CHI95 = 7.814728
-"""Chi-square of three degrees of freedom."""
+CHI95 = 7.814728  # Chi-square of three degrees of freedom.
 
 
 class Score(NamedTuple):
-    """One rig.
-
-    ``z``: by parameter, error over its standard deviation. ``inside``: share of published poses within their 95 %
-    ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the noise.
-    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unreported``:
+    """One rig. ``z``: by parameter, error over its standard deviation. ``inside``: share of published poses within
+    their 95 % ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the
+    noise. ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unreported``:
     parameters that the Fisher information leaves open and calibrate does not report; ``message``: the reverse.
-    ``moved``: the group that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it
-    cannot tell that from.
-    """
+    ``moved``: the group that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it cannot
+    tell that from."""
 
     z: dict[str, float]
     inside: float
@@ -249,10 +224,8 @@ def errors_over_sd(seed: int, reference: float) -> dict[str, float]:
     return {n: float((found.values[i] - truth[n]) / found.sd[i]) for i, n in enumerate(NAMES) if n in truth}
 
 
-REFERENCE_SCALE = 5e-4
-"""Relative standard deviation of the lengths, and of the angles, of the reference."""
-POINTING = 2e-6
-"""rad, standard deviation by which a beam has turned since the zero was taken."""
+REFERENCE_SCALE = 5e-4  # Relative standard deviation of the lengths, and of the angles, of the reference.
+POINTING = 2e-6  # rad, standard deviation by which a beam has turned since the zero was taken.
 DRIFT, WARMER, AREA = 40e-6, 2.0, 10e-3
 """Largest drift of a detector, 1/K of its length, over so many K; its length, m."""
 CERTIFIED = {
@@ -269,8 +242,7 @@ CERTIFIED = {
     'zero_blocks': 25.0,
 }
 """Inputs of the certificate as this generator has them."""
-STATED, HELD = 6, 4
-"""Poses of each rig, one estimate at each, and blocks for which each is held."""
+STATED, HELD = 6, 4  # Poses of each rig, one estimate at each, and blocks for which each is held.
 
 
 class Certified(NamedTuple):

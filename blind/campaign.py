@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every campaign shares: its options, its cases over several processes with a bar, and its end."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The cases of the suite: hidden effects, drawn from the case's own seed and scaled to a stated gap.
-
-The gap is the rms over x1 y1 x2 y2 of the block-mean dots, effect minus nominal, both without
-noise, in units of the gap from noise alone (2 mV rms over 20 samples: 0.2236 um). Mains hum is null
-in block means at some frequencies: its gap is that of single samples over their noise.
-"""
-
-from __future__ import annotations
+"""The cases of the suite: hidden effects, drawn from the case's own seed and scaled to a stated gap."""
 
 import functools
 import math
@@ -24,8 +17,7 @@ from blind.generator import Array, Generator
 BLOCK = 20
 FLOOR = generator.SIGMA * generator.MM_PER_V / math.sqrt(BLOCK)
 SIZES = (1.0, 3.0, 10.0)
-NOISES = ('heavy', 'coloured', 'loud', 'flicker')
-"""Other noise than the rig file's."""
+NOISES = ('heavy', 'coloured', 'loud', 'flicker')  # Other noise than the rig file's.
 
 SHOWS_ACROSS_LENGTHS = frozenset(
     (
@@ -197,8 +189,7 @@ ALIENS = tuple(n for n in DRAWS if n.startswith('alien_'))
 @dataclass(frozen=True)
 class Case:
     """One run. ``wanted``: (effect, gap in floors), not yet scaled. ``without``: effects left out of the library.
-    ``mistake``: of the set-up, with its size.
-    """
+    ``mistake``: of the set-up, with its size."""
 
     key: str
     kind: str
@@ -269,8 +260,7 @@ def scaled(case_seed: int, name: str, gap: float, design: tuple[Generator, ...])
 
 def possible(effect: Mapping[str, Any]) -> bool:
     """Whether a machine can have it: no second mode swings farther than the link bends, as some must to be seen if the
-    loads were applied slowly.
-    """
+    loads were applied slowly."""
     return effect['name'] != 'second_bending_mode' or float(abs(effect['gain'])) <= 1.0
 
 

@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How well ``validate`` tells the offset between two clocks: ``python -m blind.clock --runs 200``.
-
-A link rings after two steps. Two detectors see it at 1 kHz, a camera at 30 frames a second whose clock is
-off by up to 0.4 s. The dots are where two fixed beams meet a flat plate that is displaced and turned about Z; the
-motion and the dots share no code with the package.
-"""
-
-from __future__ import annotations
+"""How well ``validate`` tells the offset between two clocks: ``python -m blind.clock --runs 200``."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,10 +15,8 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.validate.clock import Offset, clock_offset
 from psd_deflection.studies.validate.motion import Motion
 
-CENTERS = ((0.0, 0.07), (-0.1, 0.0))
-"""m, of the thesis rig."""
-MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))
-"""Hz, and m, m, rad a step."""
+CENTERS = ((0.0, 0.07), (-0.1, 0.0))  # m, of the thesis rig.
+MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))  # Hz, and m, m, rad a step.
 
 
 def truth(t: Array, steps: tuple[float, ...] = (1.0, 3.7)) -> Array:
@@ -102,8 +93,7 @@ def motion_of(t: Array, readings: Array) -> Motion:
 @dataclass
 class Score:
     """``errors``: of the offset, s. ``inside``: 95 % intervals that hold the truth. ``reported``: runs with an
-    answer.
-    """
+    answer."""
 
     errors: list[float]
     inside: int = 0

@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``.
-
-Samples come from :mod:`blind.generator`, with noise that the rig file does not describe; the estimates
-are the product's own pipeline's. Each row is a rig: 100 s at rest, then sixteen steps of 50 N (sidebar,
-on and off) with 5 s of ringing each. The truth is the pose at the middle of the block.
-"""
-
-from __future__ import annotations
+"""How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``."""
 
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -27,14 +20,11 @@ from psd_deflection.records import DeflectionEstimate, RawChunk, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 
 SIZE = 20
-CHI_SQUARE_3 = 7.814728
-"""95 % of a chi-square of 3 degrees of freedom."""
-SETTLED = 100
-"""Blocks before the noise is measured; they are not counted at rest."""
+CHI_SQUARE_3 = 7.814728  # 95 % of a chi-square of 3 degrees of freedom.
+SETTLED = 100  # Blocks before the noise is measured; they are not counted at rest.
 SHIFTS = ((0.31372e-3, -0.27182e-3), (0.16180e-3, 0.46692e-3))
 """Where the PSDs are off their places, so that no reading stands in the middle of a converter's step, m."""
-RISE = 10.0
-"""K."""
+RISE = 10.0  # K.
 DRIFT = ({'x': 0.4e-6, 'y': -0.3e-6}, {'x': -0.2e-6, 'y': 0.4e-6})
 """Of the dots of each PSD, m/K: up to 40 ppm/K of its half width of 10 mm, as makers state it."""
 LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (0.0, 8)}
@@ -43,10 +33,8 @@ LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (
 @dataclass(frozen=True, slots=True)
 class Row:
     """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V.
-
     ``stated``: the rig file names the noise of each channel. ``corner``: Hz, at which 1/f noise is as much as the
-    white.
-    """
+    white."""
 
     label: str
     sigmas: tuple[float, ...] = (2e-3,) * 6
@@ -76,10 +64,8 @@ ROWS = (
 UNEQUAL = ROWS[-1]
 SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))
 """What the estimates do not cover in full."""
-TONES = (5.0, 20.0, 45.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)
-"""Hz of a steady vibration."""
-SHAKEN = (8e-6, 20e-6, 0.1e-3)
-"""Its amplitudes: dX, dY m, theta rad, each with a phase of its own."""
+TONES = (5.0, 20.0, 45.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
+SHAKEN = (8e-6, 20e-6, 0.1e-3)  # Its amplitudes: dX, dY m, theta rad, each with a phase of its own.
 
 
 class Inside(NamedTuple):
@@ -207,9 +193,7 @@ def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeli
 
 def warming(reported: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
     """Readings that drift with temperature by what makers of PSDs state, ``DRIFT``, while it rises by ``RISE``.
-
-    ``reported``: the rig file has the drift, and the temperature is told once a second, to 0.1 K.
-    """
+    ``reported``: the rig file has the drift, and the temperature is told once a second, to 0.1 K."""
     fine = _poses(rest_s, steps)
     warm = np.linspace(0.0, RISE, len(fine))
     names = [{'name': 'thermal_drift', 'psd': psd, **drift} for psd, drift in enumerate(DRIFT, 1)]
@@ -255,8 +239,7 @@ def _errors(got: Sequence[DeflectionEstimate], truth: Array) -> tuple[Array, Arr
 
 class Shaken(NamedTuple):
     """A link that vibrates steadily. ``sd`` (3,): median of the published ones. ``named``: share of the blocks that say
-    that it vibrates; ``reported``: of those whose error is beyond 3 standard deviations, NaN if there are none.
-    """
+    that it vibrates; ``reported``: of those whose error is beyond 3 standard deviations, NaN if there are none."""
 
     inside: Inside
     sd: tuple[float, float, float]
@@ -288,10 +271,8 @@ def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **ov
 
 
 def alarms(row: Row, seed: int) -> tuple[int, int]:
-    """Blocks of a faultless recording whose readings are said to contradict each other, and all its blocks.
-
-    Sixty seconds at rest and twelve steps, no loss.
-    """
+    """Blocks of a faultless recording whose readings are said to contradict each other, and all its blocks. Sixty
+    seconds at rest and twelve steps, no loss."""
     clean, _ = motion(60, 12)
     # Before a zero the readings of a rig with offsets do contradict each other.
     own = replace(row, offsets=())
@@ -315,9 +296,7 @@ def false_alarms(seeds: int, rows: int | None = None) -> int:
 
 def coarse(poses: int = 150, seed: int = 1, *, reported: bool = True, **overrides: object) -> Inside:
     """Return a 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses.
-
-    ``reported``: the rig file says so, not 16 bit.
-    """
+    ``reported``: the rig file says so, not 16 bit."""
     rng = np.random.default_rng(seed)
     row = Row('10 bit', bits=10)
     more = {'converter.bits': 10 if reported else 16, **overrides}

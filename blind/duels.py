@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""discover_in beside other methods, on machines that others measured: ``make campaign NAME=duels``.
-
-The data are no part of this repository. Nested: a fold's readings are taken out, and terms and sizes are found without.
-"""
-
-from __future__ import annotations
+"""discover_in beside other methods, on machines that others measured: ``make campaign NAME=duels``."""
 
 import os
 import sys
@@ -203,9 +198,7 @@ def of_balls(data: Path, found: Model) -> Iterator[tuple[str, float]]:
 
 class Duel(NamedTuple):
     """``make``: the machine, of the folder of the data; ``known``: the same with what is published in its model.
-
-    ``is_linear``: in all terms; None: too large for folds. ``test``: figures on data that no search has.
-    """
+    ``is_linear``: in all terms; None: too large for folds. ``test``: figures on data that no search has."""
 
     make: Callable[[Path], Plant]
     is_linear: bool | None = False

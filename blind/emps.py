@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A positioning system driven by a voltage (EMPS): a plant for ``discover_in``.
-
-The data are the public benchmark of a drive (nonlinearbenchmark.org; repository wmkouw/NSI-EMPS, MIT licence). The
-model is M q'' = gain u - Fv q' - Fc sgn(q') - offset. Every two seconds the simulation starts again from the measured
-state.
-"""
-
-from __future__ import annotations
+"""A positioning system driven by a voltage (EMPS): a plant for ``discover_in``."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -24,8 +17,7 @@ MASS, VISCOUS, COULOMB, OFFSET, GAIN = 95.1089, 203.5034, 20.3935, -3.1648, 35.1
 """kg, N s/m, N, N, N/V, as published."""
 RATE = 1000.0
 STEP = 2  # Samples a step of the simulation.
-KEPT = 10
-"""Every tenth sample of the position is compared."""
+KEPT = 10  # Every tenth sample of the position is compared.
 SEGMENT_S = 2.0
 
 
@@ -65,15 +57,10 @@ class Emps(Plant):
     period = KEPT / RATE
 
     def __init__(
-        self,
-        without: Sequence[str],
-        folder: Path,
-        record: str = 'emps.csv',
-        segment: float = SEGMENT_S,
+        self, without: Sequence[str], folder: Path, record: str = 'emps.csv', segment: float = SEGMENT_S
     ) -> None:
         """``record``: a file, ``.csv`` or the benchmark's ``.mat``; ``segment``: s after which the simulation starts
-        again. Raises OSError if ``folder`` has no such file.
-        """
+        again. Raises OSError if ``folder`` has no such file."""
         rows = _read(folder / record)
         n = round(segment * RATE)
         count = len(rows) // n
@@ -88,10 +75,7 @@ class Emps(Plant):
         self._start = np.stack([position[:, 0], speed])
         self._measured = [row[None, ::KEPT] for row in position]
         self.cases = tuple(f'{segment * i:.0f} s' for i in range(count))
-        self._terms = (
-            0.0 if 'coulomb_friction' in without else COULOMB,
-            0.0 if 'force_offset' in without else OFFSET,
-        )
+        self._terms = (0.0 if 'coulomb_friction' in without else COULOMB, 0.0 if 'force_offset' in without else OFFSET)
 
     def measured(self) -> list[FloatArray]:
         """Position, m."""

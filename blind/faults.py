@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One wrong reading after the other, and how far the estimates are off: ``python -m blind.faults``.
-
-Each reading is dead, stuck, or inverted, each PSD's axes are exchanged, under loads of 10 to 50 N.
-"""
-
-from __future__ import annotations
+"""One wrong reading after the other, and how far the estimates are off: ``python -m blind.faults``."""
 
 import sys
 from collections.abc import Sequence
@@ -19,10 +14,8 @@ from psd_deflection.measure.pipeline import Pipeline
 
 def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int = 1) -> tuple[float, str]:
     """Largest error in own standard deviations of any estimate of a rig with one wrong reading, and what is named.
-
     ``kind``: dead, stuck, inverted (``channel`` 0 to 3: x1, y1, x2, y2) or swapped (0 or 1: the PSD whose x and y are
-    exchanged). Four seconds at rest, then ``load`` (N, N, N m) switched on for four.
-    """
+    exchanged). Four seconds at rest, then ``load`` (N, N, N m) switched on for four."""
     n = 8000
     loads = np.zeros((n, 3))
     loads[n // 2 + 7 :] = load

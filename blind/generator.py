@@ -1,16 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
 """A second rig simulation, written from docs/simulation.md alone; imports nothing of
-``psd_deflection.model.simulation``.
-
-Its methods are different: the motion is integrated by Runge-Kutta of order four at a fifth of a
-millisecond (as one matrix polynomial a step, the loads held over each sample), the optics intersect
-each beam with the plate in three dimensions by solving a linear system, lag and delay act on the
-five times finer signal, and hysteresis runs sample by sample. Any physics beyond the nominal rig is
-an effect and is listed in the truth.
-"""
-
-from __future__ import annotations
+``psd_deflection.model.simulation``."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -53,11 +44,9 @@ def _rk4(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _march(a: Array, b: Array, held: Array, start: Array) -> Array:
-    """States (n * FINER, 2) from ``start`` (2,); ``held`` (n, 1) is the input from each sample to the next.
-
-    FINER steps make a sample; within a sample the input is held. So the matrices of the steps are
-    multiplied once, and the loop runs over samples.
-    """
+    """States (n * FINER, 2) from ``start`` (2,); ``held`` (n, 1) is the input from each sample to the next. FINER steps
+    make a sample; within a sample the input is held. So the matrices of the steps are multiplied once, and the loop
+    runs over samples."""
     p, q = _rk4(a, b)
     reach, push = [np.eye(2)], [np.zeros((2, 1))]
     for _ in range(FINER):
@@ -362,8 +351,7 @@ def output(volts: Array, effects: Sequence[Spec], bits: int = 16) -> Array:
 
 def noise(n: int, kind: str, seed: int) -> Array:
     """(n, 6) V: ``white``, ``heavy`` (Student's t, 4 degrees), ``coloured`` (AR 0.5), ``loud`` (1.5 sigma), ``flicker``
-    (white, and 1/f noise that is as much at 0.3 to 30 Hz).
-    """
+    (white, and 1/f noise that is as much at 0.3 to 30 Hz)."""
     rng = np.random.default_rng(seed)
     if kind == 'flicker':
         return SIGMA * flicker(n, math.exp(rng.uniform(math.log(0.3), math.log(30.0))), rng)
@@ -382,10 +370,8 @@ def noise(n: int, kind: str, seed: int) -> Array:
 
 
 def flicker(n: int, corner: float, rng: np.random.Generator) -> Array:
-    """(n, 6): white noise of unit variance, and 1/f noise whose density is as much at ``corner`` Hz.
-
-    A part of a noise four times as long: its ends do not meet.
-    """
+    """(n, 6): white noise of unit variance, and 1/f noise whose density is as much at ``corner`` Hz. A part of a noise
+    four times as long: its ends do not meet."""
     spectrum = np.fft.rfft(rng.normal(size=(4 * n, 6)), axis=0)
     f = np.fft.rfftfreq(4 * n, 1.0 / RATE)
     f[0] = f[1]

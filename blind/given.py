@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The cases of the blind suite as files, for any tool. ``python -m blind.given --out DIR``; then ``blind.run --score``.
-
-``DIR/cases/KEY`` has what was measured: a CSV and a rig file for each recording, and ``case.json``. The truths are in
-``DIR/sealed``, with their hash, before any tool has run. A tool writes ``DIR/answers/KEY.json``; docs/blind.md has the
-rules, and what an answer holds.
-"""
-
-from __future__ import annotations
+"""The cases of the blind suite as files, for any tool. ``python -m blind.given --out DIR``; then ``blind.run
+--score``."""
 
 import json
 import sys

@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Laws that no catalogue has, drawn by chance over stage, variable and form; formulas of their own.
-
-Everything is computed on the generator's fine grid, sample by sample where there is a memory. Nothing is taken from
-``psd_deflection``. A law that an effect of the catalogue makes as well (a cubic r² non-linearity, a lag, a loop of the
-clamp ...) is not drawn.
-"""
-
-from __future__ import annotations
+"""Laws that no catalogue has, drawn by chance over stage, variable and form; formulas of their own."""
 
 import math
 from collections.abc import Mapping, Sequence

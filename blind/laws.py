@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Laws beyond the catalogue: ``python -m blind.laws [--laws 12] [--nulls 12] [--first 0]``.
-
-Each law is drawn (:mod:`blind.law_forms`), scaled to a gap of 5 to 30 floors and recorded with noise; discover is given
-volts, loads and temperatures. Counted are: the right stage and the right variables, named or listed as what the
-recording cannot tell from it, each also alone; the gap that remains on unseen load cases; and laws where there is
-nothing. Develop on one range of seeds and judge once on another.
-"""
-
-from __future__ import annotations
+"""Laws beyond the catalogue: ``python -m blind.laws [--laws 12] [--nulls 12] [--first 0]``."""
 
 import itertools
 import json
@@ -37,8 +29,7 @@ WANTED = {'stage': 0.90, 'variables': 0.90, 'gap': 0.80, 'alarm': 0.0}
 MOST_FLOORS = 1.2
 UNDER_ONE = 0.99
 """A law acts under one load only if so much of what it does in square, with the ringing after it, is there."""
-NOTHING = 1e-6
-"""A gap, in floors, that is none."""
+NOTHING = 1e-6  # A gap, in floors, that is none.
 
 
 def drawn(first: int, count: int) -> list[dict[str, Any]]:
@@ -141,8 +132,7 @@ def _reported_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
 
 def _reported_as_note(law: dict[str, Any], got: dict[str, Any]) -> bool:
     """Whether the law acts under one load only, and the answer is that another load hung there: no reading tells one
-    from the other.
-    """
+    from the other."""
     message = [f for f in got['setup'] if f['name'] == 'load_value']
     if len(message) != 1 or len(got['setup']) > 1 or got['effects'] or got['unknown']:
         return False

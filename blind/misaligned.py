@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Rigs that are not as their rig file says: every tolerance of docs/calibration.md drawn at once.
-
-The optics are written apart from the package: each leaning beam is intersected with each detector's surface in three
-dimensions by solving a linear system. The motion is that of :mod:`blind.generator`.
-"""
-
-from __future__ import annotations
+"""Rigs that are not as their rig file says: every tolerance of docs/calibration.md drawn at once."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,10 +26,8 @@ SPREADS: Mapping[str, float] = {
     'nonlinearity': 300.0,
 }
 BEAM_PLACE, BEAM_ANGLE, SLOPE = 0.5e-3, 3e-3, (1.5, 0.2)
-CAMERA = (10e-6, 10e-6, math.radians(0.03))
-"""Standard deviations of one frame of the reference: m, m, rad."""
-LASER = 5.0
-"""V of the sum."""
+CAMERA = (10e-6, 10e-6, math.radians(0.03))  # Standard deviations of one frame of the reference: m, m, rad.
+LASER = 5.0  # V of the sum.
 OFFSETS = ('offset_x', 'offset_y', 'offset_sum')
 
 
@@ -113,9 +105,7 @@ def poses(loads: Array) -> Array:
 
 class Light(NamedTuple):
     """Other light on one PSD. ``level``: its part of the sum, V; ``x``, ``y``: its place as the PSD reads it, V.
-
-    ``offset_x``, ``offset_y``: of the outputs of the amplifier, V, whatever light there is; ``offset_sum`` likewise.
-    """
+    ``offset_x``, ``offset_y``: of the outputs of the amplifier, V, whatever light there is; ``offset_sum`` likewise."""
 
     level: float
     x: float
@@ -194,9 +184,7 @@ def record(
     light: tuple[Light, Light] | None = None,
 ) -> Recorded:
     """What the converter and a reference say of the motion ``pose`` (n, 3); ``outliers``: share of wrong frames.
-
-    ``sigma``: V, of all channels or of each (6,). ``light``: besides that of the lasers.
-    """
+    ``sigma``: V, of all channels or of each (6,). ``light``: besides that of the lasers."""
     read = dots(rig, pose) / generator.MM_PER_V
     both = (DARK, DARK) if light is None else light
     columns = [

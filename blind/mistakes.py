@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mistakes that people make with a rig, put into a recording of the second generator; and faultless oddities."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,8 +12,7 @@ from blind.generator import Array, Generator
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.discover.observation import Observation
 
-LENGTH = 0.585
-"""m, of the rig file."""
+LENGTH = 0.585  # m, of the rig file.
 
 Make = Callable[[float, Observation, np.random.Generator], list[Observation]]
 

@@ -1,17 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How well ``identify`` tells the modes of a link: ``python -m blind.modes --rigs 200``.
-
-Each rig has a frequency of 5 to 40 Hz and a damping ratio of 0.003 to 0.06, drawn at random, and noise of 2 µm. Its
-link rings after steps at times that nobody tells, of random sizes or one weight on and off, in white noise or in one
-of 20 µm that remembers (0.9 from sample to sample), with one mode or with two that beat; or a random force drives it
-all the time. The motion is computed here, from the closed form or step by step, and shares no code with the package.
-
-``--pyoma2`` gives the same samples to pyOMA2 too (``pip install pyoma-2``): covariance-driven subspace identification
-at 100 Hz above 2 Hz, and of its stable poles the one whose frequency is nearest to the truth.
-"""
-
-from __future__ import annotations
+"""How well ``identify`` tells the modes of a link: ``python -m blind.modes --rigs 200``."""
 
 import math
 from collections.abc import Iterable
@@ -32,10 +21,8 @@ RATE = 1000.0
 
 @dataclass(frozen=True)
 class Link:
-    """``modes``: Hz, damping ratio and share of the step that the mode rings with.
-
-    ``noise``: m; ``memory``: of one sample for the one before it.
-    """
+    """``modes``: Hz, damping ratio and share of the step that the mode rings with. ``noise``: m; ``memory``: of one
+    sample for the one before it."""
 
     modes: tuple[tuple[float, float, float], ...]
     noise: float = 2e-6
@@ -91,10 +78,8 @@ def driven(link: Link, rng: np.random.Generator, seconds: float = 60.0, rms: flo
 
 def bound(link: Link, seconds: float = 60.0, rms: float = 200e-6) -> tuple[float, float]:
     """Least standard deviations of the first mode's frequency and damping ratio that :func:`driven` allows, relative.
-
     Cramer and Rao, from the information in a spectrum (Whittle): I = T int (d log S) (d log S)^T df of frequency,
-    damping ratio, size and noise, none of which is known.
-    """
+    damping ratio, size and noise, none of which is known."""
     hertz, zeta, _ = link.modes[0]
     # Even in the angle of a Lorentzian: half of the places lie within the resonance.
     f = hertz * np.maximum(1.0 + zeta * np.tan(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 40_001)[1:-1]), 0.0)
@@ -163,9 +148,7 @@ def by_pyoma2(samples: Array, hertz: float) -> tuple[Mode, ...]:
 
 class Case(NamedTuple):
     """``operation``: driven all the time. ``equal``: see :func:`rung`. ``memory``: of the noise, which is then 20 µm.
-
-    ``beside``: the second of two modes is so many times as high, each with half of the step.
-    """
+    ``beside``: the second of two modes is so many times as high, each with half of the step."""
 
     operation: bool = False
     equal: bool = False

@@ -1,22 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How well the filter of the motion does: ``python -m blind.motion --runs 20``.
-
-A link with the thesis's dimensions is at rest for three seconds. Then its load is switched at random times (steps),
-swept (chirp) or wanders (operation), or its base is turned about three axes by joints (joint), whose acceleration the
-filter is told 250 times a second, or is not told (untold). Truth and samples are computed here, by matrix exponentials
-or Runge and Kutta and the exact plate, with the rig's noise and converter, without the product's simulator. The samples
-go through the whole pipeline.
-
-Columns: rms error of the velocity by the filter (``own``: what its covariance says), and by the Savitzky-Golay filter
-of block means that does best, which knows the future; normalised innovations squared a sample, ``inside``: share of
-the seconds in which they are in their 95 % band; rms error of the pose between the blocks, predicted and held.
-
-Below the table: the same error by frequency, from the chirp, as the largest ratio of predicted to held up to the first
-mode; and the share of the poses that are inside three standard deviations after 100 ms without samples.
-"""
-
-from __future__ import annotations
+"""How well the filter of the motion does: ``python -m blind.motion --runs 20``."""
 
 import copy
 import math
@@ -41,29 +25,21 @@ REST = 3.0
 BLOCK = 20
 AXES = ('dX', 'dY', 'theta')
 KINDS = ('steps', 'chirp', 'operation', 'joint')
-UNTOLD = 'untold'
-"""As ``joint``, but the filter is told nothing."""
-BEHIND = 0.3
-"""So far behind the base is the point about which joints turn it, m."""
+UNTOLD = 'untold'  # As ``joint``, but the filter is told nothing.
+BEHIND = 0.3  # So far behind the base is the point about which joints turn it, m.
 FASTEST = (6.0, 6.0, 15.0)
 """Largest angular acceleration about x, y and z, rad/s^2; twice as much in the middle of a raised cosine."""
-REPORTED = 4
-"""Samples from one message about the base's acceleration to the next."""
-PARTS = 2
-"""Steps of Runge and Kutta in a sample."""
-UNSEEN = 100
-"""Samples that do not come."""
-BANDS = 8
-"""Bands of frequency of a chirp."""
+REPORTED = 4  # Samples from one message about the base's acceleration to the next.
+PARTS = 2  # Steps of Runge and Kutta in a sample.
+UNSEEN = 100  # Samples that do not come.
+BANDS = 8  # Bands of frequency of a chirp.
 LATER = np.arange(1, BLOCK + 1) / RATE
 
 
 @dataclass(frozen=True)
 class Run:
     """One link in motion at 1 kHz. ``loads`` (n, 3), ``pose`` (n, 3), ``velocity`` (n, 3): truth; ``volts`` (n, 6).
-
-    ``reported``: of the base, in order.
-    """
+    ``reported``: of the base, in order."""
 
     loads: Array
     pose: Array
@@ -116,10 +92,8 @@ def moved(loads: Array) -> tuple[Array, Array]:
 
 def turns(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Rates of turn (n, 3), rad/s, and angular accelerations (n, 3), rad/s^2, at times ``t`` of a base on three joints.
-
     Each joint moves again and again: it speeds up, goes on and slows down, with steps of the acceleration or with
-    raised cosines.
-    """
+    raised cosines."""
     rate, acceleration = np.zeros((len(t), 3)), np.zeros((len(t), 3))
     for axis, most in enumerate(FASTEST):
         begin = REST
@@ -137,11 +111,9 @@ def turns(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple[BaseAcceleration, ...]]:
-    """Pose and velocity (n, 3) of a link without load whose base turns, and what is told of the base.
-
-    In the frame of the base the tip is a mass on springs; what its base does to it is base + alpha x r + omega x
-    (omega x r) + 2 omega x r', with r = (dX, dY, L), by Runge and Kutta.
-    """
+    """Pose and velocity (n, 3) of a link without load whose base turns, and what is told of the base. In the frame of
+    the base the tip is a mass on springs; what its base does to it is base + alpha x r + omega x (omega x r) + 2 omega
+    x r', with r = (dX, dY, L), by Runge and Kutta."""
     n, h = round(seconds * RATE), 1.0 / (RATE * PARTS)
     # Each step from just after its begin to just before its end.
     t = (np.arange(n * PARTS)[:, None] * h + np.array([1e-9, 0.5 * h, h - 1e-9])).ravel()
@@ -217,14 +189,11 @@ def volts_of(pose: Array, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True)
 class Result:
-    """Of B blocks in motion; (B, 3) unless said otherwise.
-
-    ``velocity``, ``own``: error of the velocity at the end of a block, and the standard deviation that it is given.
-    ``smoothed``: error of the best Savitzky-Golay filter in the middle. ``squares``: NIS of a block. ``predicted``,
-    ``held`` (20 B, 3): error of the pose at each sample until the next block is there. ``pose``, ``pose_own``.
-    ``unseen``: error of the pose 100 ms after the block if no more samples come, in standard deviations; NaN in the
-    last five.
-    """
+    """Of B blocks in motion; (B, 3) unless said otherwise. ``velocity``, ``own``: error of the velocity at the end of a
+    block, and the standard deviation that it is given. ``smoothed``: error of the best Savitzky-Golay filter in the
+    middle. ``squares``: NIS of a block. ``predicted``, ``held`` (20 B, 3): error of the pose at each sample until the
+    next block is there. ``pose``, ``pose_own``. ``unseen``: error of the pose 100 ms after the block if no more samples
+    come, in standard deviations; NaN in the last five."""
 
     velocity: Array
     own: Array
@@ -280,10 +249,8 @@ def rms(errors: Array) -> float:
 
 
 def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
-    """Return the run through the pipeline, against the truth.
-
-    What is told of the base comes ``late`` samples after its stamp.
-    """
+    """Return the run through the pipeline, against the truth. What is told of the base comes ``late`` samples after its
+    stamp."""
     pipeline = Pipeline(rig)
     motion = pipeline.motion_filter
     if motion is None:
@@ -342,11 +309,9 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one axis; rms values in m, rad, m/s, rad/s.
-
-    ``velocity``: error, ``own``: what the filter says of it, ``smoothed``: that of Savitzky and Golay. ``nis`` a
-    sample; ``inside``: share of the blocks whose NIS is in its 95 % band. ``predicted``, ``held``: errors of the pose.
-    """
+    """Of one axis; rms values in m, rad, m/s, rad/s. ``velocity``: error, ``own``: what the filter says of it,
+    ``smoothed``: that of Savitzky and Golay. ``nis`` a sample; ``inside``: share of the blocks whose NIS is in its 95 %
+    band. ``predicted``, ``held``: errors of the pose."""
 
     velocity: float
     own: float

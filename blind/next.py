@@ -1,27 +1,17 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Does ``discover --next`` plan recordings that settle what one leaves open? ``make campaign NAME=blind-next``.
+"""Does ``discover --next`` plan recordings that settle what one leaves open? ``make campaign NAME=blind-next``."""
 
-The second generator hides one effect in a recording of a poor design. Where ``discover`` then says that several effects
-explain it as well, the recording that it plans is made by the second generator, and so on. Where it says that no
-recording within the limits would help, every recording that it could have planned is made, and the search is asked
-again: if that separates them, the answer was wrong.
-"""
-
-from __future__ import annotations
-
-import json
 import sys
 import time
 import zlib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from blind.campaign import conclude, options, over
-from blind.cases import DRAWS, EFFECTS, MIMICKED, gap_of, scaled
+from blind.cases import DRAWS, EFFECTS, gap_of, scaled
 from blind.generator import Array, Generator
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
@@ -31,8 +21,7 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan
 
 RIG = load_rig()
-GAP = 4.0
-"""Size of the hidden effect in the first recording, in floors."""
+GAP = 4.0  # Size of the hidden effect in the first recording, in floors.
 MOST = 3
 WANTED_SHARE, WANTED_MEDIAN = 1.0, 1.0
 
@@ -162,18 +151,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = options(__doc__, jobs=1)
     parser.add_argument('--only', default='', help='only effects whose name contains this')
     parser.add_argument('--designs', default='', help='only first recordings whose name contains this')
-    parser.add_argument('--mimicked', action='store_true', help='only effects that others can replace exactly')
-    parser.add_argument('--gap', type=float, default=GAP, help='size of the hidden effect, in floors')
-    parser.add_argument('--out', help='file for the rows, as JSON')
     args = parser.parse_args(argv)
-    effects = [n for n in EFFECTS if args.only in n and (n in MIMICKED or not args.mimicked)]
-    jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in effects]
-    rows = []
-    for row in over(ask_next, jobs, args.jobs):
-        rows.append(row)
-        if args.out:
-            Path(args.out).write_text(json.dumps(rows, indent=1))
-    return conclude(*table(rows))
+    effects = [n for n in EFFECTS if args.only in n]
+    jobs = [(n, d, GAP) for d in first_recordings() if args.designs in d for n in effects]
+    return conclude(*table(list(over(ask_next, jobs, args.jobs))))
 
 
 if __name__ == '__main__':

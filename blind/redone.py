@@ -1,19 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The thesis's experiment redone, with the product's own commands: camera, calibrate, validate, replay.
-
-    python -m blind.redone --out build/thesis
-    python -m blind.redone --out build/short --short
-
-A simulated rig has hidden misalignments (:mod:`blind.misaligned`). Weights of 10, 30 and 50 N are hung on the
-sidebar, on both sides in turn, and on the link. The PSDs are read at 1 kHz; a camera of 30 frames a second looks at
-three discs (:mod:`blind.render`), with a clock of its own. ``camera`` measures every recording, ``calibrate`` takes
-those of the sidebar, ``validate`` judges those of the link, by the camera and by the truth. All is on one page,
-``page.html``; ``summary.json`` has the figures. The exit status is 1 if an error on the link is beyond ``LIMIT``
-(with ``--short``: beyond 0.5 %).
-"""
-
-from __future__ import annotations
+"""The thesis's experiment redone, with the product's own commands: camera, calibrate, validate, replay."""
 
 import contextlib
 import csv
@@ -43,16 +30,11 @@ from psd_deflection.rig.parameter_files import with_values
 
 ROOT = Path(__file__).resolve().parents[1]
 NOMINAL = ROOT / 'config' / 'thesis_rig.yaml'
-ARM = 0.585
-"""From the link to the weight on the sidebar, m."""
-LEAN = 0.054
-"""How far the weight's line is off the rig's Y axis, rad: 0.12 mm of dX at 50 N."""
-CLOCK = 7.3e-3
-"""By how much the camera's clock is ahead, s."""
-RAMP_S = 0.35
-"""Time in which a hand lets go of a weight, s."""
-LIMIT = 0.002
-"""Largest error on the link, as a share of the deflection at 50 N."""
+ARM = 0.585  # From the link to the weight on the sidebar, m.
+LEAN = 0.054  # How far the weight's line is off the rig's Y axis, rad: 0.12 mm of dX at 50 N.
+CLOCK = 7.3e-3  # By how much the camera's clock is ahead, s.
+RAMP_S = 0.35  # Time in which a hand lets go of a weight, s.
+LIMIT = 0.002  # Largest error on the link, as a share of the deflection at 50 N.
 WEIGHTS = {'sidebar': (0.03, 0.5, 10.0, 0.1), 'link': (3.0, 0.5, 10.0, 0.1)}
 """Of the thesis, tuned by hand for either place of the load."""
 AXES = ('dx', 'dy', 'theta')

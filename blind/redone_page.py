@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of :mod:`blind.redone`: figures 5.12 to 5.29 and Table 5.1 of the thesis anew."""
 
-from __future__ import annotations
-
 import base64
 import html
 import math
@@ -32,8 +30,7 @@ PRINTED = {'theta': ('-7.4 %', '1.5 %'), 'dx': ('84 %', '21 %'), 'dy': ('5.8 %',
 """Table 5.1 of the thesis: iterative, weighted least squares."""
 NUMBERS = {'sidebar_right_50N': '5.12-5.14', 'sidebar_right_30N': '5.15-5.17', 'sidebar_right_10N': '5.18-5.20'}
 NUMBERS |= {'link_50N': '5.21-5.26', 'link_30N': '5.27-5.29'}
-CALM = 1.0
-"""s at the end of a recording in which the link rests under its weight."""
+CALM = 1.0  # s at the end of a recording in which the link rests under its weight.
 
 
 class Curves(NamedTuple):
@@ -55,8 +52,7 @@ def page_of(
 ) -> str:
     """Return the page, pictures inside."""
     return page(
-        'The experiment of the thesis, redone',
-        _body(folder, forces, summary, drawn, cameras, answers, truth, typed),
+        'The experiment of the thesis, redone', _body(folder, forces, summary, drawn, cameras, answers, truth, typed)
     )
 
 

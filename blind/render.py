@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Draws what a camera sees of the target on the tip plate: the judge of the detector, written apart from it.
-
-Coverage is anti-aliased by area: pixels on a rim are cut in 15 x 15 parts, each of which is followed back through the
-lens onto the plate. The exposure is a mean over instants of the real motion; then come the lens's blur, uneven light,
-noise of two kinds, and the converter. The blur comes before the pixels, as in a camera: the image is blurred in pixels
-cut 3 x 3, and then put together. The other way round, the width of an edge and its place (by up to 0.01 px) change
-with where it lies in its pixel. Nothing here is taken from the package.
-"""
-
-from __future__ import annotations
+"""Draws what a camera sees of the target on the tip plate: the judge of the detector, written apart from it."""
 
 import functools
 import math
@@ -22,8 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 Array = npt.NDArray[np.float64]
 PARTS = 5
-CUTS = 3
-"""Parts of a pixel on a side before the blur; parts of such a part at a rim."""
+CUTS = 3  # Parts of a pixel on a side before the blur; parts of such a part at a rim.
 
 
 @dataclass(frozen=True)
@@ -91,10 +81,7 @@ def distort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, Arr
     k1, k2, p1, p2, k3 = [*distortion, *([0.0] * 5)][:5]
     rr = x**2 + y**2
     f = 1 + k1 * rr + k2 * rr**2 + k3 * rr**3
-    return (
-        x * f + 2 * p1 * x * y + p2 * (rr + 2 * x**2),
-        y * f + p1 * (rr + 2 * y**2) + 2 * p2 * x * y,
-    )
+    return (x * f + 2 * p1 * x * y + p2 * (rr + 2 * x**2), y * f + p1 * (rr + 2 * y**2) + 2 * p2 * x * y)
 
 
 def undistort(x: Array, y: Array, distortion: Sequence[float]) -> tuple[Array, Array]:
@@ -136,10 +123,7 @@ def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array
     normal = tip[:, 2]
     far = (normal @ at) / (normal[0] * x + normal[1] * y + normal[2])
     px, py, pz = far * x - at[0], far * y - at[1], far - at[2]
-    return (
-        tip[0, 0] * px + tip[1, 0] * py + tip[2, 0] * pz,
-        tip[0, 1] * px + tip[1, 1] * py + tip[2, 1] * pz,
-    )
+    return (tip[0, 0] * px + tip[1, 0] * py + tip[2, 0] * pz, tip[0, 1] * px + tip[1, 1] * py + tip[2, 1] * pz)
 
 
 def pixels_of(scene: Scene, pose: Pose, points: Array) -> Array:
@@ -249,11 +233,9 @@ def developed(scene: Scene, grey: Array, rng: np.random.Generator) -> npt.NDArra
 
 def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float]) -> Array:
     """Grey levels without noise of a flat picture on the tip plate in place of discs: ``texture`` is its white share,
-    ``size`` m, its middle at the origin.
-
-    A pixel whose corners and middle are not all alike is sampled at the 21 places of a Fibonacci lattice in each of its
-    parts, no two of which are in a row or a column: an edge along the rows of the image is then as fine as any other.
-    """
+    ``size`` m, its middle at the origin. A pixel whose corners and middle are not all alike is sampled at the 21 places
+    of a Fibonacci lattice in each of its parts, no two of which are in a row or a column: an edge along the rows of the
+    image is then as fine as any other."""
     box = (0, 0, scene.width, scene.height)
     ray_x, ray_y, k = rays(box, scene.focal, tuple(scene.centre), tuple(scene.distortion))
     sign = 1.0 if scene.view == 'outside' else -1.0

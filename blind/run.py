@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run the blind suite: seal the truths, let discover answer, score. ``python -m blind.run --help``.
-
-Truths and thresholds are written and hashed before the first answer; discover is given volts, loads
-and temperatures, nothing else. Each answer is saved immediately, and a stopped run continues where it was.
-"""
-
-from __future__ import annotations
+"""Run the blind suite: seal the truths, let discover answer, score. ``python -m blind.run --help``."""
 
 import argparse
 import dataclasses

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scores of the blind suite: against thresholds that were fixed beforehand, with intervals."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
@@ -268,10 +266,8 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     sheet.rate('false alarm, gaps, outliers, start under load, own zeros', odd, alarm, 0.0, 0.01, False)
 
 
-NEAR = {'load_time': 0.05, 'load_ramp': 0.15, 'load_delay': 5e-4}
-"""s by which a told time may be off."""
-TOLERANCES = (0.25, 0.25, 0.12)
-"""N, N, N m, and 2 %, by which a told load may be off."""
+NEAR = {'load_time': 0.05, 'load_ramp': 0.15, 'load_delay': 5e-4}  # s by which a told time may be off.
+TOLERANCES = (0.25, 0.25, 0.12)  # N, N, N m, and 2 %, by which a told load may be off.
 
 
 def _reported(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool, bool]:
@@ -372,8 +368,7 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
 
 def _names_none(r: Row) -> bool:
     """Return whether an effect is named that is none: neither it nor one that cannot be distinguished from it is
-    hidden.
-    """
+    hidden."""
     return any(not any(t['name'] in s for t in r.truth) for s in r.sets)
 
 

@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The Silverbox, an electronic circuit that is a mass on a spring that stiffens: a plant for ``discover_in``.
-
-The data are the public benchmark of nonlinearbenchmark.org (Wigren and Schoukens 2013): input and output voltage at
-610.35 Hz, first a noise that grows (the arrow), then multisines. The model is y'' + 2 z w y' + w^2 y = w^2 g u; w, z
-and g begin with the values of a linear difference equation and are nuisance. Only the training part of the official
-split is searched. Every stretch is simulated from measured states, some samples before what is compared.
-"""
-
-from __future__ import annotations
+"""The Silverbox, an electronic circuit that is a mass on a spring that stiffens: a plant for ``discover_in``."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -23,20 +15,15 @@ from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 FILE = 'SNLS80mV.csv'
-RATE = 1e7 / 2**14
-"""Hz."""
-TRAIN = (40650, 105712)
-"""Samples of the official split: three quarters of the multisines."""
+RATE = 1e7 / 2**14  # Hz.
+TRAIN = (40650, 105712)  # Samples of the official split: three quarters of the multisines.
 TESTS = {'multisine': (105712, 127400), 'arrow': (100, 40575), 'arrow, no extrapolation': (100, 32100)}
-START = 50
-"""Samples of a test that may show its state and that do not count."""
+START = 50  # Samples of a test that may show its state and that do not count.
 CASES, COLUMNS, COMPARED, BEFORE = 10, 25, 100, 50
 """Stretches of the training part; pieces of each that are simulated side by side; samples of a piece that are compared,
-and those before them.
-"""
+and those before them."""
 SUBSTEPS = 4
-SPEED = 1e-3
-"""V; Coulomb friction turns round within this speed over w."""
+SPEED = 1e-3  # V; Coulomb friction turns round within this speed over w.
 
 
 def _effect_of(
@@ -96,15 +83,9 @@ class Silverbox(Plant):
     nuisance = NUISANCE
     period = 1.0 / RATE
 
-    def __init__(
-        self,
-        folder: Path,
-        train: tuple[int, int] = TRAIN,
-        shape: tuple[int, int] = (CASES, COLUMNS),
-    ) -> None:
+    def __init__(self, folder: Path, train: tuple[int, int] = TRAIN, shape: tuple[int, int] = (CASES, COLUMNS)) -> None:
         """``shape``: cases, and pieces of each. Raises OSError if ``folder`` has no such file, ValueError if it has no
-        numbers or ends before ``train`` does.
-        """
+        numbers or ends before ``train`` does."""
         self.u, self.y = read(folder)
         cases, columns = shape
         if not BEFORE + cases * columns * COMPARED <= train[1] - train[0] <= len(self.u) - train[0]:
@@ -132,11 +113,9 @@ class Silverbox(Plant):
         return [piece.reshape(1, -1) for piece in np.split(out.T, len(self.cases))]
 
     def run(self, model: Model, first: IntArray, count: int) -> FloatArray:
-        """Output (count, pieces) from the measured states at the samples ``first`` on.
-
-        Between samples the input is the band-limited function through them. The linear part is exact for a force that
-        is held over a substep; what is not linear is that of the middle of the substep.
-        """
+        """Output (count, pieces) from the measured states at the samples ``first`` on. Between samples the input is the
+        band-limited function through them. The linear part is exact for a force that is held over a substep; what is
+        not linear is that of the middle of the substep."""
 
         def of(name: str, parameter: str) -> float:
             return model[name][parameter] if name in model else 0.0
@@ -177,8 +156,7 @@ class Silverbox(Plant):
 
     def _forced(self, delay: float, within: float = 0.5) -> FloatArray:
         """The input (n, SUBSTEPS) at the share ``within`` of each substep, ``delay`` later: the band-limited function
-        through the samples.
-        """
+        through the samples."""
         n = len(self.u)
         turn = 2j * np.pi * np.arange(len(self._spectrum)) / n
         at = (np.arange(SUBSTEPS) + within) / SUBSTEPS - delay * RATE

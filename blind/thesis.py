@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's own discrepancies: the sizes of effects that close them, and what the methods make of Table 5.1."""
 
-from __future__ import annotations
-
 import math
 import sys
 

@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Does the watch see what happens to a rig, and is it silent while nothing does? ``make campaign NAME=blind-watch``.
-
-The second generator makes the readings; the pipeline makes the records from them, and the watch reads these. Each run
-holds a load, and at an instant drawn by chance the bench is bumped (the readings of one PSD jump by 5 um in some
-direction), the gain of one PSD changes by 2 %, or the clamp slips by 20 urad about some axis, so that the link rings.
-The quiet hours have the same loads over and over with fresh noise, a drift of the readings, and loads that are noted up
-to two seconds late.
-"""
-
-from __future__ import annotations
+"""Does the watch see what happens to a rig, and is it silent while nothing does? ``make campaign NAME=blind-watch``."""
 
 import math
 import sys
@@ -24,15 +15,7 @@ from blind.generator import EI, GJ, LSB, MM_PER_V, SIGMA, Array, Generator
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm, Watch
 from psd_deflection.model.solvers.registry import solver_from_rig
-from psd_deflection.records import (
-    AppliedLoad,
-    BlockStatus,
-    DeflectionEstimate,
-    RawChunk,
-    Record,
-    SpotMeans,
-    TipLoad,
-)
+from psd_deflection.records import AppliedLoad, BlockStatus, DeflectionEstimate, RawChunk, Record, SpotMeans, TipLoad
 from psd_deflection.rig.config import load_rig
 
 RATE, LENGTH = 1000, 0.585
@@ -44,8 +27,7 @@ LEVELS = ((0, 0, 0), (0, -30, 0), (0, -50, -29.25), (40, 0, 0), (0, -20, 20), (-
 DRIFT, DRIFT_HOURS = 2e-6, 3.0
 HOLD_S, HOLDS = 30, 12
 BLOCK, CHUNK = 20, 1000
-FITTED = 1.5
-"""A parabola through a block has so many times the noise of its mean, in the middle (sqrt(9/4))."""
+FITTED = 1.5  # A parabola through a block has so many times the noise of its mean, in the middle (sqrt(9/4)).
 PROCESS_NOISE = np.zeros((4, 4))
 
 
@@ -130,11 +112,9 @@ def watch_run(job: tuple[str, int]) -> Run:
 
 
 def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
-    """Hours in which nothing happens: hours, alarms, what they said, and seconds of the watch for each block.
-
-    The watch is given block means of the second generator's clean readings with fresh noise, as much as a block's fit
-    leaves, and the poses that the method has for them: a day of samples would take the pipeline half an hour.
-    """
+    """Hours in which nothing happens: hours, alarms, what they said, and seconds of the watch for each block. The watch
+    is given block means of the second generator's clean readings with fresh noise, as much as a block's fit leaves, and
+    the poses that the method has for them: a day of samples would take the pipeline half an hour."""
     hours, seed = job
     rng = np.random.default_rng(seed)
     rig = load_rig()

@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Audits pages with axe-core in headless Chromium: ``make docs STEP=axe`` for the site, the tests for the rest.
-
-axe-core (Deque) comes with the package axe-core-python. A page is audited in light and in dark colours, and as
-wide as a phone. Only the rules that axe calls violations count; what it cannot decide is for a person's eyes.
-"""
-
-from __future__ import annotations
+"""Audits pages with axe-core in headless Chromium: ``make docs STEP=axe`` for the site, the tests for the rest."""
 
 import argparse
 import functools

@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A contract of import-linter that lists what each room may import, instead of what it may not.
-
-``pure`` names the libraries that every module may import. A line of ``rooms`` is
-``ROOM: LIBRARY LIBRARY``: what the modules of that room may import besides. A line for a module
-inside a room adds to the room's line. The contract is broken by an import that no line allows, by a
-room of the package without a line, by a line that allows what nobody imports, and by a line that
-names no module. So a new import or a new room is seen without anybody extending a list.
-"""
-
-from __future__ import annotations
+"""A contract of import-linter that lists what each room may import, instead of what it may not."""
 
 from collections.abc import Iterable, Mapping
 
@@ -61,11 +52,7 @@ def imported(graph: ImportGraph) -> dict[str, set[str]]:
     }
 
 
-def broken_by(
-    imports: Mapping[str, set[str]],
-    pure: set[str],
-    lines: Mapping[str, list[str]],
-) -> list[str]:
+def broken_by(imports: Mapping[str, set[str]], pure: set[str], lines: Mapping[str, list[str]]) -> list[str]:
     """What of ``imports`` (module to libraries) the ``lines`` (room to libraries) do not allow."""
     out = []
     used: set[tuple[str, str]] = set()

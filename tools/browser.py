@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Headless Chromium with its driver, for the page's tests, pictures and timing."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import http.server

@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make demo NAME=firmware``: runs the firmware in qemu, joins its UART to the daemon, and checks every sample.
-
-The daemon opens the pseudo-terminal that qemu makes, as it opens any port. The synthetic converter's
-counts are a function of the sample's number, so that each is checked, not only counted.
-"""
-
-from __future__ import annotations
+"""``make demo NAME=firmware``: runs the firmware in qemu, joins its UART to the daemon, and checks every sample."""
 
 import argparse
 import sys
@@ -104,10 +98,8 @@ def dialogue(port: str) -> tuple[int, float]:
 
 
 class Checked:
-    """Counts samples and those whose counts are not what the firmware makes of their number.
-
-    ``enough`` is set once their stamps span ``seconds``.
-    """
+    """Counts samples and those whose counts are not what the firmware makes of their number. ``enough`` is set once
+    their stamps span ``seconds``."""
 
     def __init__(self, seconds: float) -> None:
         self.samples = 0

@@ -1,13 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Converts recordings for Rerun, reads them with its own reader and looks at its picture (``make demo NAME=rerun``).
-
-Poses, bands, dots, sums and losses must equal those of the recording, and gaps must stay gaps.
-Without a screen, the viewer gets a virtual one (xvfb-run, a software Vulkan: apt install xvfb mesa-vulkan-drivers).
-
-  python -m tools.check_rerun bags/lost_samples --out build/rerun
-  python -m tools.check_rerun bags/lost_samples --out build/rerun --figure docs/figures/rerun.png
-"""
+"""Converts recordings for Rerun, reads them with its own reader and looks at its picture (``make demo NAME=rerun``)."""
 
 from __future__ import annotations
 
@@ -37,8 +30,7 @@ VIEWER_S = 180.0
 LIGHT = (255, 80, 60)
 SHARE = 5e-4
 """Minimum share of pixels in a trace's colour (measured: 2e-3); an empty viewport has a few, from its icons."""
-FIGURE_SPEED = 4.0
-"""Playback speed: slow enough that nothing has moved when the picture is taken."""
+FIGURE_SPEED = 4.0  # Playback speed: slow enough that nothing has moved when the picture is taken.
 
 
 def need(true: bool, what: str) -> None:

@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Builds the action FollowJointTrajectory for a Python without ROS 2 from apt: control_msgs has no wheel.
-
-  python -m tools.control_msgs
-
-It prints the folder to put on PYTHONPATH: build/control_msgs/…, made once by the generators that
-rclpy's wheels bring along, and by a C++ compiler. Names, types and order of the fields are those of
-control_msgs for Jazzy; with others DDS would not take it for the same action.
-"""
-
-from __future__ import annotations
+"""Builds the action FollowJointTrajectory for a Python without ROS 2 from apt: control_msgs has no wheel."""
 
 import fcntl
 import hashlib

@@ -1,16 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From a plain Debian to the live page: by pip, and by the .deb of bloom's templates; both timed.
-
-``python -m tools.deb FOLDER`` (``make release STEP=deb ARGS=FOLDER``; root only, some minutes).
-FOLDER: a checkout of ros/rosdistro.
-It makes the templates for Ubuntu noble and for Debian bookworm, as ``bloom-generate rosdebian`` does for Jazzy. In
-a chroot that debootstrap makes it runs the one line of docs/quickstart.md, then builds the .deb of noble, installs it
-and starts it. A package that provides their names stands in for the packages of ROS, which Debian does not have.
-Nothing outside the folder ``--work`` is written.
-"""
-
-from __future__ import annotations
+"""From a plain Debian to the live page: by pip, and by the .deb of bloom's templates; both timed."""
 
 import argparse
 import os
@@ -27,8 +17,7 @@ from tools.release import ROOT, changelog_rst
 from tools.rosdistro import our_rows, prepared
 
 PAGE = re.compile(r'http://127\.0\.0\.1:\d+/')
-LONGEST = 3600.0
-"""s: longer than this nobody waits for a step on a busy machine; an idle one needs a minute or two."""
+LONGEST = 3600.0  # s: longer than this nobody waits for a step on a busy machine; an idle one needs a minute or two.
 
 ENTER = """
 mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc" && cp /etc/resolv.conf "$1/etc/resolv.conf" || exit 1

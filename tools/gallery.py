@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes docs/gallery.md and its pictures: ``python -m tools.gallery``.
-
-Each case of :mod:`tools.gallery_cases` is a simulated rig with one fault. The command of the case is run on its
-recording; the page gets the plot of the recording and, word for word, what the command says.
-"""
-
-from __future__ import annotations
+"""Makes docs/gallery.md and its pictures: ``python -m tools.gallery``."""
 
 import contextlib
 import io
@@ -14,20 +8,23 @@ import re
 import shlex
 import sys
 import tempfile
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from blind.campaign import conclude, options, over
 from psd_deflection.cli.main import main as psd_deflection
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed
-from psd_deflection.records import SampleBlock
+from psd_deflection.records import CHANNELS, SampleBlock
 from psd_deflection.run.diagnostics import OK, CounterSnapshot, estimates_entry, laser_entry
 from psd_deflection.run.monitor.spectrum import Spectrum, line_entry
-from tools.gallery_cases import CASES, STUDIES, Case
 from tools.program import ROOT
 
 PAGE = ROOT / 'docs' / 'gallery.md'
@@ -35,11 +32,82 @@ FIGURES = ROOT / 'docs' / 'figures' / 'gallery'
 NUMBER = re.compile(r'(?<![\w.])[+\-−]?\d+(?:\.(\d+))?(?:e([+-]?\d+))?')
 ALIKE = re.compile(r'[\w.]*\d[\w.]*|[+\-−]?Δ?[XYθ]\b|[+\-−](?=#)')
 """What lines of the same kind differ in: names of channels and axes, numbers."""
-LONGEST = 80
-"""Characters of a line; the rest is cut."""
-WIDTH = 760
-"""Pixels of a picture, as wide as the column of the site."""
+LONGEST = 80  # Characters of a line; the rest is cut.
+WIDTH = 760  # Pixels of a picture, as wide as the column of the site.
 COLOURS = 24
+RATE_HZ = 1000
+Columns = dict[str, npt.NDArray[np.float64]]
+"""A CSV recording, column by column."""
+
+
+def _scaled(c: Columns, **factors: float) -> Columns:
+    return {n: f * c[n] for n, f in factors.items()}
+
+
+def _held(c: Columns, **volts: float) -> Columns:
+    return {n: np.full_like(c[n], v) for n, v in volts.items()}
+
+
+def _line(c: Columns, *, hertz: float, **volts: float) -> Columns:
+    """A sine, sampled as it comes: above half the rate it appears at another frequency."""
+    return {n: c[n] + v * np.sin(2.0 * np.pi * hertz * c['t']) for n, v in volts.items()}
+
+
+def _coarse(c: Columns, *, step: float) -> Columns:
+    return {n: step * np.round(c[n] / step) for n in CHANNELS}
+
+
+def _dark(c: Columns) -> Columns:
+    """Laser 2 goes off after a second."""
+    rng = np.random.default_rng(1)
+    return {n: np.where(c['t'] >= 1.0, rng.normal(0.0, 0.002, len(c['t'])), c[n]) for n in CHANNELS[3:]}
+
+
+def _frozen(c: Columns) -> Columns:
+    """PSD 1 keeps the values that it had after a second."""
+    at = int(np.searchsorted(c['t'], 1.0))
+    return {n: np.where(c['t'] >= 1.0, c[n][at], c[n]) for n in CHANNELS[:3]}
+
+
+def _shifted(c: Columns, *, seconds: float, names: Sequence[str]) -> Columns:
+    """Late by so long; what was first holds before."""
+    late = round(seconds * RATE_HZ)
+    return {n: np.concatenate((np.full(late, c[n][0]), c[n][:-late])) for n in names}
+
+
+def _moved(c: Columns, *, after: float, **offsets: float) -> Columns:
+    """A jump after so many seconds."""
+    return {n: c[n] + offset * (c['t'] >= after) for n, offset in offsets.items()}
+
+
+CHANGES: Mapping[str, Callable[..., Columns]] = {
+    f.__name__[1:]: f for f in (_scaled, _held, _line, _coarse, _dark, _frozen, _shifted, _moved)
+}
+
+
+class Study(NamedTuple):
+    """One part of the page; what the fields mean stands in tools/gallery_cases.toml."""
+
+    title: str
+    about: str
+    command: str
+    message: str = '.+'
+
+
+class Case(NamedTuple):
+    """``do``: what a person does; ``change``: names of :data:`CHANGES` with their arguments."""
+
+    name: str
+    study: str
+    title: str
+    simulate: str
+    do: str = ''
+    change: Mapping[str, Mapping[str, Any]] = {}
+
+
+_TABLES = tomllib.loads(Path(__file__).with_name('gallery_cases.toml').read_text(encoding='utf-8'))
+STUDIES = {name: Study(**study) for name, study in _TABLES['studies'].items()}
+CASES = tuple(Case(**case) for case in _TABLES['cases'])
 
 
 def run(words: list[str]) -> str:
@@ -55,12 +123,15 @@ def run(words: list[str]) -> str:
 def record(case: Case, folder: Path) -> Path:
     """The recording of the case: simulated, then changed as the case says."""
     path = folder / f'{case.name}.csv'
-    run(['simulate', '--out', str(path), *shlex.split(case.simulate)])
-    if case.change is not None:
+    words = re.sub(r'\b[A-Z_]{4,}\b', lambda word: str(_TABLES['loads'][word[0]]), case.simulate)
+    run(['simulate', '--out', str(path), *shlex.split(words)])
+    if case.change:
         names = path.read_text().partition('\n')[0].split(',')
         # A reference is in the rows of its frames only.
         table = np.genfromtxt(path, delimiter=',', skip_header=1)
-        columns = case.change({name: table[:, i] for i, name in enumerate(names)})
+        columns = {name: table[:, i] for i, name in enumerate(names)}
+        for name, arguments in case.change.items():
+            columns |= CHANGES[name](columns, **arguments)
         text = io.StringIO()
         np.savetxt(text, np.column_stack(list(columns.values())), '%.10g', ',', header=','.join(names), comments='')
         path.write_text(text.getvalue().replace('nan', ''))
@@ -167,10 +238,8 @@ def kept() -> dict[str, str]:
 
 
 def same(now: str, before: str) -> bool:
-    """Whether two answers have the same words, and numbers that agree within 5 % or two of their last digit.
-
-    Other processors round otherwise. A number without a decimal point is a count, and the 2 of y2 a word.
-    """
+    """Whether two answers have the same words, and numbers that agree within 5 % or two of their last digit. Other
+    processors round otherwise. A number without a decimal point is a count, and the 2 of y2 a word."""
     if NUMBER.sub('#', now) != NUMBER.sub('#', before):
         return False
     for a, b in zip(NUMBER.finditer(now), NUMBER.finditer(before), strict=True):

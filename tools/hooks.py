@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mends the site's pages for people and screen readers while mkdocs builds them."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,19 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make mutants``: break the numerics one line at a time, and see whether a test notices.
-
-cosmic-ray makes the mutants: a sign, a number, a comparison, a truth value. Of each room so many are
-drawn with a fixed seed, each is put into a copy of this checkout, and those quick tests of the room that enter
-the function run until one fails. What they do not notice is tried by the slow tests of the room, if it has any. What
-no test notices is listed; tools/mutants_equivalent.txt has those that nobody could notice, each with the reason, and
-they do not count.
-
-With ``--by-hand`` the mutants are those of tools/mutants_by_hand.txt: errors that people make and no operator does, as
-a transposed matrix, half a sample, the index of another PSD.
-
-  python -m tools.mutants --count 32 --rooms solvers plate
-  python -m tools.mutants --by-hand --rooms chains
-"""
+"""``make mutants``: break the numerics one line at a time, and see whether a test notices."""
 
 from __future__ import annotations
 
@@ -42,8 +29,7 @@ ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
 NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
 """Broken files that a test has noticed, "DIGEST STAGE" a line: only what was not is tried again. Delete it to begin
-anew.
-"""
+anew."""
 
 
 OPERATORS = (
@@ -139,9 +125,7 @@ def function_at(text: str, line: int) -> int:
 @contextmanager
 def warm(python: str, folder: Path, tier: str, tests: Sequence[str]) -> Iterator[Callable[[str, int], bool]]:
     """Says whether those of ``tests`` that enter a function pass in a copy of the checkout: its file and first line.
-
-    Raises RuntimeError if they do not pass as it is.
-    """
+    Raises RuntimeError if they do not pass as it is."""
     environment = {**os.environ, 'PYTHONPATH': str(folder), 'PYTHONDONTWRITEBYTECODE': '1'}
     command = [python, str(ROOT / 'tools' / 'warm_pytest.py'), tier, *tests]
     with subprocess.Popen(command, cwd=folder, env=environment, stdin=-1, stdout=-1, text=True) as process:
@@ -167,18 +151,15 @@ def warm(python: str, folder: Path, tier: str, tests: Sequence[str]) -> Iterator
 
 
 STAGES = ('quick', 'slow')
-TIER_OF = {'quick': 'quick', 'slow': 'all'}
-"""The quick tests of a room are those that `make test` runs."""
+TIER_OF = {'quick': 'quick', 'slow': 'all'}  # The quick tests of a room are those that `make test` runs.
 
 
 def tried(
     name: str, python: str, count: int, seed: int | None, known: Container[str], slow: bool
 ) -> Iterator[tuple[str, str]]:
-    """The mutants of one room in words, and which of the ``STAGES`` noticed; '' if none did.
-
-    ``seed``: of those that are drawn; None: those made by hand. The slow tests, if they are asked (``slow``), do not
-    try what is ``known`` to change no answer. Raises RuntimeError if the tests fail without.
-    """
+    """The mutants of one room in words, and which of the ``STAGES`` noticed; '' if none did. ``seed``: of those that
+    are drawn; None: those made by hand. The slow tests, if they are asked (``slow``), do not try what is ``known`` to
+    change no answer. Raises RuntimeError if the tests fail without."""
     room = ROOMS[name]
     lines = NOTICED.read_text().splitlines() if NOTICED.exists() else []
     noticed = dict(line.split(' ') for line in lines)

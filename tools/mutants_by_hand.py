@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that people make and no operator does, of ten kinds: what ``make mutants`` tries besides.
-
-Without cosmic-ray, so that the tests can ask whether each still is a change of one line.
-"""
-
-from __future__ import annotations
+"""Errors that people make and no operator does, of ten kinds: what ``make mutants`` tries besides."""
 
 from pathlib import Path
 from typing import NamedTuple

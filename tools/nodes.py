@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Prints what every ROS node does alike: a row a check, a column a node.
-
-  python -m tools.nodes [WORDS FOR PYTEST]
-
-The checks are the tests of test/ros/test_conformance.py; a note says why one does not apply to a node. Exit status 1
-if a check failed or a cell is empty.
-"""
-
-from __future__ import annotations
+"""Prints what every ROS node does alike: a row a check, a column a node."""
 
 import re
 import sys

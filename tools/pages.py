@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the tables of docs/ that the program has already: topics, commands, parameters, exit statuses, effects.
-
-``python -m tools.pages`` prints the number of words of docs/, too.
-"""
-
-from __future__ import annotations
+"""Writes the tables of docs/ that the program has already: topics, commands, parameters, exit statuses, effects."""
 
 import itertools
 import re

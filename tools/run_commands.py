@@ -1,16 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the commands of README and docs as a reader would: ``make docs STEP=commands``.
-
-What ends in a moment is run by test/docs/test_docs.py; what CI runs anyway is looked up in .ci/run. The rest is run
-here, block by block, in a copy of the checkout: a daemon or a page is started on the simulated device, seen to
-work by what it says, and ended by Ctrl-C; a campaign runs in its shortest form. Lines that cannot be run here are
-printed with the reason: ``ros2`` lines need a ROS 2 from apt (the ``apt`` job of .github/workflows/ci.yml has one and
-runs them), and nothing is typed as root or to another machine. An entry of the tables below that the documents no
-longer have is an error.
-"""
-
-from __future__ import annotations
+"""Runs the commands of README and docs as a reader would: ``make docs STEP=commands``."""
 
 import contextlib
 import fcntl
@@ -40,8 +30,7 @@ SPOKEN_OF = re.compile(r'(psd-deflection (NAME|[a-z-]+)|ros2 [a-z]+( [a-z]+)?)$'
 """Names of commands that take arguments: no reader types them as they stand."""
 INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,}.+\n)*', re.M)
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
-CUT = 'recordings/cut'
-"""A recording that a crash left without its end."""
+CUT = 'recordings/cut'  # A recording that a crash left without its end.
 
 CI_RUNS = (
     (r"^make test( ROOM=measure| PYTEST='--order 3')?$", '.ci/run', 'make test '),
@@ -74,11 +63,7 @@ CI_RUNS = (
     (r'^make bits$', '.ci/run', 'make bits '),
     (r"^pip install '\.\[rerun\]'$", 'tools/tasks.py', "'.[rerun]'"),
     (r'^psd-deflection convert .*\.rrd$|^rerun ', 'tools/tasks.py', 'tools.check_rerun bags/'),
-    (
-        r"^pip install '\.\[ros,monitor,plot\]'$",
-        'Makefile',
-        "INSTALL,$(VENV)) '.[ros,monitor,plot]'",
-    ),
+    (r"^pip install '\.\[ros,monitor,plot\]'$", 'Makefile', "INSTALL,$(VENV)) '.[ros,monitor,plot]'"),
     (r'^python -m bench\.live$', 'tools/tasks.py', "('live', "),
     (r'^python bench/solvers\.py$', 'tools/tasks.py', "('solvers', "),
     (r'^python bench/accuracy\.py$', 'tools/tasks.py', "('accuracy', "),
@@ -124,8 +109,7 @@ ADMINISTRATION = re.compile(
 )
 """Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
 
-HOURS = re.compile(r'^make mutants\b')
-"""Campaigns whose shortest form says nothing: never run here."""
+HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says nothing: never run here.
 
 FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b)')
 """Reads data of others, which are not in the repository: test_duels.py does, if it is there."""
@@ -149,8 +133,7 @@ BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compen
 AT_THE_BENCH = re.compile(r'^psd-deflection calibrate --live\b')
 """Records with a running daemon while the lines below it load the tip."""
 
-ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')
-"""Commands that speak to a running daemon."""
+ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')  # Commands that speak to a running daemon.
 
 
 class Command(NamedTuple):
@@ -439,9 +422,7 @@ def copy_checkout(target: Path) -> None:
 
 def main() -> int:
     """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed.
-
-    ``--no-campaigns``: without those that have a short form.
-    """
+    ``--no-campaigns``: without those that have a short form."""
     # A shell that runs us in the background has it ignored, and so would all that we start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     campaigns = NO_CAMPAIGNS not in sys.argv

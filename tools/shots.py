@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of the live page in docs/figures: ``make docs STEP=shots``; needs Chromium and its driver.
-
-The page shows the simulated rig after all load cases, with 50 N on the sidebar; then a recording in which a laser
-goes out, and a rig whose cable was pulled. With ``--widths`` page and reports at every width, light and dark.
-"""
-
-from __future__ import annotations
+"""Makes the pictures of the live page in docs/figures: ``make docs STEP=shots``; needs Chromium and its driver."""
 
 import argparse
 import base64
@@ -93,8 +87,7 @@ def away_without(device: Program) -> Callable[[Any], bool]:
 WIDTHS = {390: 844, 768: 1024, 1024: 768, 1440: 900, 1920: 1080}
 """Of a phone, a tablet, a small and a usual laptop, a desk: width and height, px."""
 SCHEMES = ('light', 'dark')
-SHEET_HEIGHT = 300
-"""Pixels of each picture on the sheet of all."""
+SHEET_HEIGHT = 300  # Pixels of each picture on the sheet of all.
 EVERYWHERE = Path(__file__).resolve().parents[1] / 'build' / 'shots'
 
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What ``make bench``, ``campaign``, ``demo``, ``docs`` and ``release`` start; ``list`` prints the names."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import shutil
@@ -18,10 +16,8 @@ ROOT = Path(__file__).parent.parent
 
 class Task(NamedTuple):
     """``line``: a shell command; further arguments are appended. ``shortest``: arguments that end it in seconds.
-
     ``verdict``: a pattern of its last lines, also when it was cut short. ``fresh``: a folder that is removed first.
-    ``packages``: of PyPI, installed into ``environment`` (default: ours). ``apt``: packages by the program of each.
-    """
+    ``packages``: of PyPI, installed into ``environment`` (default: ours). ``apt``: packages by the program of each."""
 
     line: str
     what: str
@@ -247,9 +243,8 @@ BENCH = (
     # module, arguments of a look, arguments that end it in seconds
     ('live', '--seconds 12 --settle 2 --starts 2', '--rounds 1 --seconds 2 --settle 1 --starts 0'),
     ('limits', '--minutes 2 --seconds 20 --times 3', '--times 1 --only frames'),
-    ('each_sample', '--seconds 10', '--seconds 2'),
     ('rigs', '--most 32 --seconds 4', '--most 1 --seconds 1'),
-    ('cpu', '--no-native --seconds 8', '--no-native --seconds 2'),
+    ('cpu', '--seconds 8', '--seconds 2'),
     ('solvers', '--blocks 200000', '--blocks 1000'),
     ('accuracy', '--blocks 1000', '--blocks 100'),
 )

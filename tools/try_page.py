@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the page "Try it in the browser" of the site as a visitor does (``make docs STEP=try-page``); needs Chromium.
-
-The site is served as files, and the browser knows no other host. What is hidden must be named, nothing must be named
-if nothing is hidden, and axe-core must have nothing against the page with an answer.
-"""
-
-from __future__ import annotations
+"""Runs the page "Try it in the browser" of the site as a visitor does (``make docs STEP=try-page``); needs Chromium."""
 
 import argparse
 import base64
@@ -26,12 +20,10 @@ LIMIT_S = 1200.0
 """Longest wait for an answer: a busy machine, both cores taken, computes many times as long as an idle one."""
 
 NO_OTHER_HOST = '--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1'
-HIDDEN = (0, 'drawn', '')
-"""What is chosen, one after the other: the first of the list, one drawn by chance, nothing."""
+HIDDEN = (0, 'drawn', '')  # What is chosen, one after the other: the first of the list, one drawn by chance, nothing.
 
 NOTHING = 'Nothing is missing: '
-SIZE = (940, 1250)
-"""Of the picture."""
+SIZE = (940, 1250)  # Of the picture.
 
 
 def state(driver: Any) -> str:

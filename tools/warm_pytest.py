@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run pytest in one child after another of a process that has imported all libraries already.
-
-Arguments: a tier of the tests (quick, slow, all), then files and folders. At first all of them are run, to see which
-functions of the checkout each test enters and how long it takes; the first line of the output is 1 if all passed, 0 if
-not. Then each line of the input is a file of the checkout and the first line of a function in it, 0 for what is in no
-function. The tests that enter it are run, the quickest first, as many as take ``MOST`` seconds together, and a line of
-the output is 1 if all passed, 0 if not. Every child imports the program again.
-"""
-
-from __future__ import annotations
+"""Run pytest in one child after another of a process that has imported all libraries already."""
 
 import contextlib
 import functools
@@ -35,11 +26,9 @@ OPTIONS = (
 
 OURS = ('psd_deflection', 'msg_adapters', 'test', 'blind', 'bench', 'tools')
 
-LONGEST = 600.0
-"""s that one of the arguments may take at first."""
+LONGEST = 600.0  # s that one of the arguments may take at first.
 
-MOST = 120.0
-"""s, as measured at first, that the tests of one function may take together."""
+MOST = 120.0  # s, as measured at first, that the tests of one function may take together.
 
 Entered = dict[int, CodeType]
 
@@ -52,10 +41,8 @@ class Test(NamedTuple):
 
 
 class Watch:
-    """A plugin of pytest that notes which functions each test enters.
-
-    What is entered while modules are imported counts for all tests, a fixture for all tests of its file.
-    """
+    """A plugin of pytest that notes which functions each test enters. What is entered while modules are imported counts
+    for all tests, a fixture for all tests of its file."""
 
     def __init__(self) -> None:
         self._common: Entered = {}
@@ -142,10 +129,7 @@ def watched(tier: str, tests: Sequence[str], answer: Path) -> int:
 
 
 def known(tier: str, tests: Sequence[str]) -> dict[str, Test] | None:
-    """Those of a tier that ``tests`` (the arguments) choose, by name.
-
-    None if one fails or is not found by its name.
-    """
+    """Those of a tier that ``tests`` (the arguments) choose, by name. None if one fails or is not found by its name."""
     out: dict[str, Test] = {}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, 'seen.json')
@@ -159,10 +143,8 @@ def known(tier: str, tests: Sequence[str]) -> dict[str, Test] | None:
 
 
 def chosen(tests: dict[str, Test], file: str, first: int) -> list[str]:
-    """Those of ``tests`` that enter the function that begins in line ``first`` of ``file``, the quickest first.
-
-    0: all, those that enter a function of ``file`` first.
-    """
+    """Those of ``tests`` that enter the function that begins in line ``first`` of ``file``, the quickest first. 0: all,
+    those that enter a function of ``file`` first."""
     near = {name: any(f == file for f, _ in test.entered) for name, test in tests.items()}
     names = [name for name, test in tests.items() if first == 0 or (file, first) in test.entered]
     names.sort(key=lambda name: (not near[name], tests[name].seconds))

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts words that only this tree used in identifiers: ``python -m tools.words``; status 1 if any is left."""
 
-from __future__ import annotations
-
 import io
 import re
 import sys
@@ -11,7 +9,7 @@ import tokenize
 from collections import Counter
 from pathlib import Path
 
-"""The word that is no longer used, and what the field writes."""
+# The word that is no longer used, and what the field writes.
 FINISHED = {
     'refused': 'rejected',
     'refuse': 'reject',
@@ -49,9 +47,8 @@ FINISHED = {
     'freed': 'with_free',
     'turned': 'rotated',
 }
-"""Names of other people."""
-FOREIGN = {'ConnectionRefusedError'}
-"""A test's name is a sentence in plain words."""
+FOREIGN = {'ConnectionRefusedError'}  # Names of other people.
+# A test's name is a sentence in plain words.
 SENTENCE = re.compile('test_[a-z0-9]+_[a-z0-9]+_[a-z0-9_]+')
 ROOMS = ('psd_deflection', 'msg_adapters', 'launch', 'test', 'bench', 'blind', 'tools', 'bags')
 

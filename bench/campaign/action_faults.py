@@ -1,15 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The action's part of :mod:`bench.campaign.hold`: goals of FollowJointTrajectory through the shaper, over real DDS.
-
-A stand-in of joint_trajectory_controller serves the action. While a goal is under way the controller dies or rejects, a
-goal is cancelled, replaced, or cannot be followed. Every goal must end within a bounded time, and the command must not
-step; it is judged as in :mod:`bench.campaign.shaper_faults`.
-
-  python -m bench.campaign.hold --times 20 --only action
-"""
-
-from __future__ import annotations
+"""The action's part of :mod:`bench.campaign.hold`: goals of FollowJointTrajectory through the shaper, over real DDS."""
 
 import signal
 import time
@@ -32,8 +23,7 @@ OTHERS = (
     'controller dies',
     'controller says nothing more',
 )
-MOST_S = 30.0
-"""Longest time until a goal ends that nobody follows any more, s."""
+MOST_S = 30.0  # Longest time until a goal ends that nobody follows any more, s.
 
 
 class Followed(Moved):

@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes that ``bench.campaign.messages`` attacks: each as it is used, what is right for it, and what is not.
-
-A node is made in this process. :data:`GOOD` has a good message of each input that any of them subscribes to; an input
-that is not there makes the campaign fail.
-"""
-
-from __future__ import annotations
+"""The nodes that ``bench.campaign.messages`` attacks: each as it is used, what is right for it, and what is not."""
 
 import contextlib
 import time
@@ -54,8 +48,7 @@ CHAIN = ROOT / 'config' / 'two_links.yaml'
 NAMES = ['shoulder', 'elbow']
 JOINTS = [1.2, 0.6]
 MOST_STEP = 1.0 + 1e-6
-FASTEST = 1.0
-"""Speed limit of the joints of the URDF file, rad/s."""
+FASTEST = 1.0  # Speed limit of the joints of the URDF file, rad/s.
 Good = Callable[[], Any]
 
 
@@ -179,14 +172,11 @@ def good_of(topic: str, kind: type) -> Good:
 
 
 class Attacked(ABC):
-    """A node in this process. ``hand``: gives it an encoded message as DDS does; set by whoever attacks.
-
-    ``words``: of its command, for the same as a process.
-    """
+    """A node in this process. ``hand``: gives it an encoded message as DDS does; set by whoever attacks. ``words``: of
+    its command, for the same as a process."""
 
     words: ClassVar[tuple[str, ...]] = ()
-    every: ClassVar[int] = 6
-    """So many strange messages come between what is right."""
+    every: ClassVar[int] = 6  # So many strange messages come between what is right.
 
     def __init__(self, owner: BaseNode[Any]) -> None:
         self.owner = owner

@@ -1,23 +1,12 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""How true the camera is: rendered frames, 10,000 of them as bad as a laboratory makes them.
-
-    python -m bench.campaign.camera --frames 10000
-    python -m bench.campaign.camera --frames 300 --only adverse
-
-Four tables: errors at the thesis's scale (rms of the discs' centres, their Cramer-Rao bound, the tip); theta by a
-ChArUco board beside theta by the discs, with their bounds; the cost of a frame beside OpenCV's ``findCirclesGrid`` on
-the same images in the same run; adverse frames, of which no answer may be further off than 5 sigma of its own
-covariance. It ends with status 1 if a bound is broken.
-"""
-
-from __future__ import annotations
+"""How true the camera is: rendered frames, 10,000 of them as bad as a laboratory makes them."""
 
 import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -35,17 +24,16 @@ from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
 
 REST = 4
-RUN = 20
-"""Frames of one rendered rig, after those at rest."""
+RUN = 20  # Frames of one rendered rig, after those at rest.
 
 SIGMAS = 5.0
 
 
-def settings_of(scene: render.Scene, rest: int = 0, *, lens: bool = True) -> CameraSettings:
+def settings_of(scene: render.Scene, rest: int = 0) -> CameraSettings:
     return CameraSettings(
         rest_frames=rest,
-        matrix=tuple(scene.matrix) if lens else (),
-        distortion=tuple(scene.distortion) if lens else (),
+        matrix=tuple(scene.matrix),
+        distortion=tuple(scene.distortion),
         view=scene.view,
         spacing=scene.spacing,
         radius=scene.radius,
@@ -191,28 +179,21 @@ def adverse(
     return np.clip(np.rint(grey + sd * rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8), truth
 
 
-def runs(
-    frames: int, seed: int, hurts: Sequence[str] = HURTS, *, lens: bool = True
-) -> Iterator[tuple[str, FrameAnswer, tuple[float, float, float]]]:
-    """What was done to a frame, its answer, the truth.
-
-    Without ``lens`` the camera is not told its matrix, and the lens has no distortion, which it could not correct.
-    """
+def runs(frames: int, seed: int) -> Iterator[tuple[str, FrameAnswer, tuple[float, float, float]]]:
+    """What was done to a frame, its answer, the truth."""
     number = done = 0
     while done < frames:
         number += 1
         rng = np.random.default_rng([seed, number])
         scene, motion = random_scene(rng), random_motion(rng)
-        if not lens:
-            scene = replace(scene, distortion=())
-        reference = CameraReference(settings_of(scene, REST, lens=lens), target_of)
+        reference = CameraReference(settings_of(scene, REST), target_of)
         for _ in range(REST):
             reference.take(0, render.photograph(scene, [render.Pose()], rng))
         if reference.rest is None:
             # The plate at rest is not whole in the picture: another rig.
             continue
         for _ in range(min(RUN, frames - done)):
-            hurt = str(rng.choice(hurts))
+            hurt = str(rng.choice(HURTS))
             image, truth = adverse(rng, scene, motion, hurt)
             yield hurt, reference.take(0, image)[0], truth
             done += 1
@@ -225,13 +206,13 @@ def off_by(answer: FrameAnswer, truth: tuple[float, float, float]) -> float:
     return float(np.max(np.abs(off) / np.sqrt(np.diag(answer.covariance))))
 
 
-def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first: int = 1, lens: bool = True) -> bool:
+def adverse_table(frames: int, seed: int) -> bool:
     """Print what became of each kind of frame; True if no answer is wrong."""
     rejected: Counter[str] = Counter()
     reasons: dict[str, Counter[str]] = {}
     sigmas: dict[str, list[float]] = {}
     sds: dict[str, list[float]] = {}
-    for hurt, answer, truth in runs(frames, seed, hurts, lens=lens):
+    for hurt, answer, truth in runs(frames, seed):
         sigmas.setdefault(hurt, [])
         if answer.status is not Status.OK:
             rejected[hurt] += 1
@@ -242,7 +223,7 @@ def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first
         sds.setdefault(hurt, []).append(1e6 * math.sqrt(max(answer.covariance[0, 0], answer.covariance[1, 1])))
     print('frame with               frames  rejected  worst/sd  rms/sd  sd um  reason')
     total = wrong = 0
-    for hurt in hurts:
+    for hurt in HURTS:
         found = np.array(sigmas.get(hurt, []))
         count = len(found) + rejected[hurt]
         total, wrong = total + count, wrong + int(np.sum(found > SIGMAS))
@@ -305,8 +286,7 @@ def accuracy_table(frames: int, seed: int) -> bool:
     return fine
 
 
-BOARD_THETA = 0.003
-"""Largest rms error of theta by a board, degrees: a tenth of what is asked of the discs."""
+BOARD_THETA = 0.003  # Largest rms error of theta by a board, degrees: a tenth of what is asked of the discs.
 
 VIEWS = {
     '640 x 480': render.Scene(focal=1700.0, turn=0.02),
@@ -339,10 +319,8 @@ def discs_picture(scene: render.Scene, pose: render.Pose) -> Any:
 
 
 def pose_bounds(scene: render.Scene, picture: Any, *nears: Any) -> Any:
-    """Cramer-Rao bounds (masks, 3) of dX m, dY m, theta rad of one frame, with all six of the pose unknown.
-
-    From the pixels of each mask.
-    """
+    """Cramer-Rao bounds (masks, 3) of dX m, dY m, theta rad of one frame, with all six of the pose unknown. From the
+    pixels of each mask."""
     shift = 0.25 * scene.distance / scene.focal
     turn = shift / 0.03
     slopes = []
@@ -438,8 +416,6 @@ def main() -> int:
     parser = options(__doc__)
     parser.add_argument('--frames', type=int, default=10_000)
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--no-lens', action='store_true', help='adverse frames of a camera that knows no lens')
-    parser.add_argument('--hurts', nargs='+', choices=HURTS, default=HURTS, metavar='NAME')
     parser.add_argument('--only', choices=('adverse', 'accuracy', 'boards', 'cost'))
     args = parser.parse_args()
     opencv().setNumThreads(1)
@@ -452,7 +428,7 @@ def main() -> int:
     if args.only in (None, 'cost'):
         cost_table(min(40, args.frames // 10 + 3), args.seed)
     if args.only in (None, 'adverse'):
-        fine &= adverse_table(args.frames, args.seed, args.hurts, lens=not args.no_lens)
+        fine &= adverse_table(args.frames, args.seed)
     return conclude(f'{time.perf_counter() - began:.0f} s', fine)
 
 

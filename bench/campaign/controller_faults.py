@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The part of :mod:`bench.campaign.hold` where the controller does something else than it reports, or keeps offsets.
-
-Each time the compensator starts anew. Judged is what the controller has: its largest step over what the rate allows,
-whether the offsets hold or go back as they must, and, where a way out is judged, how long it takes.
-"""
-
-from __future__ import annotations
+"""The part of :mod:`bench.campaign.hold` where the controller does something else than it reports, or keeps offsets."""
 
 import signal
 import time
@@ -18,15 +12,12 @@ import numpy as np
 from bench.campaign.graph import LONGEST_S, Graph
 from bench.campaign.plant import LOAD, MAX_RATE
 
-HOLDS_S = 10.0
-"""The compensator must find a wrong sign or scale within this time of its enabling, s."""
+HOLDS_S = 10.0  # The compensator must find a wrong sign or scale within this time of its enabling, s.
 RELEASE_S = 0.5
 """Offsets must be back at zero so long after the time that ``MAX_RATE`` needs, s: the way out begins with a signal."""
 ENABLINGS = 5
-DROOP = 0.005
-"""rad"""
-CREEP = 1e-9
-"""How far a command may be from the first one after ``ENABLINGS`` enablings, rad."""
+DROOP = 0.005  # rad
+CREEP = 1e-9  # How far a command may be from the first one after ``ENABLINGS`` enablings, rad.
 
 
 class Outcome(NamedTuple):

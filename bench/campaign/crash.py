@@ -1,15 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Kill -9 at random instants while recording: the file opens, lacks less than a second (``make campaign NAME=crash``).
-
-The daemon runs without ROS, forked from this process so that each round takes a moment only, and
-reads a simulated rig in real time. A round: record, kill, read what is left with our reader,
-``recover``, read it with ``rosbags``.
-
-  python -m bench.campaign.crash --times 200
-"""
-
-from __future__ import annotations
+"""Kill -9 at random instants while recording: the file opens, lacks less than a second (``make campaign
+NAME=crash``)."""
 
 import os
 import random

@@ -1,16 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make campaign NAME=faults``: a scripted campaign against the real node over a pseudo-terminal.
-
-Each fault is injected again and again while the node runs, publishes and records. What it is judged
-by: did a counter in ``/diagnostics`` see it; did samples (or estimates) come again, and how soon
-after the fault was over; and, from the recording, which samples that arrived whole are missing. A
-sample that the fault itself took (damaged, never sent, sent to nobody) is not counted as lost.
-
-  python -m bench.campaign.faults --times 20
-"""
-
-from __future__ import annotations
+"""``make campaign NAME=faults``: a scripted campaign against the real node over a pseudo-terminal."""
 
 import os
 import sys
@@ -34,8 +24,7 @@ from tools.program import PSD_DEFLECTION, Program
 
 START_S = 300.0
 RECOVER_S = 5.0
-BACK_S = 1.0
-"""A device that is back is read again within this."""
+BACK_S = 1.0  # A device that is back is read again within this.
 
 
 @dataclass(slots=True)

@@ -1,16 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Many simulated recordings on a local Dask cluster: is the answer the serial one, byte for byte, with workers killed?
-
-    python -m bench.campaign.fleet --recordings 1000
-
-Makes the recordings, each with noise, load and hidden effect of its own. Replays all in this process, then on a cluster
-of one worker, then on one of two; during the last, a worker that is busy is killed (``kill -9``) twice. Every file and
-every line must be those of the serial run. The speed of two workers over that of one says what the cluster costs; on
-a machine that does other work as well it says nothing.
-"""
-
-from __future__ import annotations
+"""Many simulated recordings on a local Dask cluster: is the answer the serial one, byte for byte, with workers
+killed?"""
 
 import contextlib
 import io

@@ -1,20 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make campaign NAME=fuzz``: coverage-guided fuzzing (atheris) of everything that reads what strangers wrote.
-
-A target must answer any bytes with a result or with one of the package's own errors, in one line,
-within a second and 256 MB. Inputs that were found to break it become tests (``test/data/fuzz``).
-
-  python -m bench.campaign.fuzz all --seconds 600 --frames 10000000 --hellos 1000000
-  python -m bench.campaign.fuzz frames -max_total_time=600
-  python -m bench.campaign.fuzz corrupted 10000000
-
-``all``: every target so long, as many damaged frames and HELLOs, and messages of any content to every node as long.
-Targets: frames, hello, bag, records, csv, parameters, yaml; ``corrupted N`` counts damaged frames instead. In hello,
-records and yaml the input chooses among what a grammar allows, so that it gets past CRCs, lengths and syntax.
-"""
-
-from __future__ import annotations
+"""``make campaign NAME=fuzz``: coverage-guided fuzzing (atheris) of everything that reads what strangers wrote."""
 
 import argparse
 import contextlib
@@ -372,8 +358,7 @@ def yaml_target() -> tuple[Target, list[bytes]]:
     return target, [bytes([4, 3, 1, 5, 2, 0, 4, 1]) * 20, bytes(range(256))]
 
 
-GRAMMARS = ('hello', 'records', 'yaml')
-"""Targets whose input is a list of choices: any bytes are an input."""
+GRAMMARS = ('hello', 'records', 'yaml')  # Targets whose input is a list of choices: any bytes are an input.
 
 TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {
     'frames': frames_target,
@@ -461,7 +446,7 @@ def main() -> int:
     if len(sys.argv) > 2 and sys.argv[1] == 'corrupted':
         return corrupted(int(sys.argv[2]))
     if len(sys.argv) < 2 or sys.argv[1] not in TARGETS:
-        print(__doc__, file=sys.stderr)
+        print(f'TARGET of {", ".join(TARGETS)}, with options of libFuzzer; or corrupted N; or all', file=sys.stderr)
         return 2
     import atheris
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph of a campaign: a simulated arm, and the compensator as a program, whose own errors a file switches on."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time
@@ -21,8 +19,7 @@ from tools.program import ROOT, Program
 URDF = ROOT / 'config' / 'two_links.urdf'
 LONGEST_S = 60.0
 ASK_AGAIN_S = 5.0
-READY = 'once it is enabled'
-"""What the compensator logs when it can be enabled."""
+READY = 'once it is enabled'  # What the compensator logs when it can be enabled.
 
 BREAKS = """
 import sys, time

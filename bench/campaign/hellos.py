@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A million HELLOs of any words against the running daemon, between the samples: it measures on.
-
-  python -m bench.campaign.hellos 1000000
-
-The words come from the grammar of ``bench.campaign.fuzz``. One HELLO of ten thousand may have another serial number;
-the daemon then takes the device for another one, leaves it and comes back, and what was under way is lost.
-"""
-
-from __future__ import annotations
+"""A million HELLOs of any words against the running daemon, between the samples: it measures on."""
 
 import random
 import sys
@@ -25,12 +17,10 @@ from psd_deflection.devices.protocol.frames import HelloFrame, encode
 from psd_deflection.recordings.read.readers import open_recording
 from tools.program import PSD_DEFLECTION, Program
 
-BACKLOG = 20_000
-"""Bytes: HELLOs wait while more than that is on its way."""
+BACKLOG = 20_000  # Bytes: HELLOs wait while more than that is on its way.
 
 OTHER_SERIAL = 10_000
-AFTER_S = 3.0
-"""Samples of that long follow the last HELLO."""
+AFTER_S = 3.0  # Samples of that long follow the last HELLO.
 
 
 def hello(chance: random.Random, number: int) -> bytes:

@@ -1,23 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make campaign NAME=hold``: what the compensator and the shaper do when something goes wrong, over real DDS.
-
-A simulated arm is on the graph. Its deflection comes through a process that stands for the
-estimator, the positions of its joints through one that stands for the robot's driver, and the real
-compensator drives it. Each fault is injected again and again while the offsets follow. Judged are
-the last time at which an offset changed after it (at most 0.2 s), the time that the offsets take to
-go back to zero when they are let go during the fault (at most that of ``max_rate`` and 0.2 s),
-whether they follow again, and the one criterion for whatever moves an arm: no step between two
-commands is larger than ``max_rate`` times the time between them, from the first to the last. Then the controller
-applies something else than it reports, or keeps offsets (:mod:`bench.campaign.controller_faults`).
-
-The shaper drives a stand-in of joint_trajectory_controller by trajectories that replace each other,
-and gets what it must reject in between; then the same by goals of FollowJointTrajectory.
-
-  python -m bench.campaign.hold --times 20
-"""
-
-from __future__ import annotations
+"""``make campaign NAME=hold``: what the compensator and the shaper do when something goes wrong, over real DDS."""
 
 import argparse
 import math
@@ -44,18 +27,14 @@ from blind.campaign import conclude, options
 from psd_deflection.ros.running import TRANSPORTS
 from tools.program import ROOT
 
-HOLD_S = 0.2
-"""The offsets must not change later than this after a fault."""
-RELEASE_S = 0.2
-"""They must be back at zero so long after the time that ``MAX_RATE`` needs."""
-WITHIN = 1.0 + 1e-6
-"""The largest step over what the rate allows."""
+HOLD_S = 0.2  # The offsets must not change later than this after a fault.
+RELEASE_S = 0.2  # They must be back at zero so long after the time that ``MAX_RATE`` needs.
+WITHIN = 1.0 + 1e-6  # The largest step over what the rate allows.
 
 TRIES = 5
 
 WATCHED_S = 0.4
-"""How long offsets are watched after a fault, s. After half a second they follow a deflection that
-jumped and stays."""
+"""How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 RELAYED = {
     'estimator': ('/arm/deflection', '/end_effector/deflection', PoseWithCovarianceStamped),
     'driver': ('/arm/joints', '/joint_states', JointState),
@@ -71,10 +50,8 @@ SENT: dict[str, tuple[int, tuple[str, ...]]] = {
 
 ROBOT = ('protective stop', 'speed scaling 0', 'controller ended', 'joints do not follow', 'another publisher')
 """Faults of the robot and its controller."""
-COMPENSATOR, CONTROLLER, SHAPER, ACTION = 'compensator', 'controller', 'shaper', 'action'
-"""All of their faults."""
-OWN = ('killed and started again', 'an error of its own')
-"""Faults of the compensator."""
+COMPENSATOR, CONTROLLER, SHAPER, ACTION = 'compensator', 'controller', 'shaper', 'action'  # All of their faults.
+OWN = ('killed and started again', 'an error of its own')  # Faults of the compensator.
 
 
 class Relay:
@@ -117,10 +94,8 @@ def relay(name: str) -> None:
 
 
 class Injected(NamedTuple):
-    """One fault: s after it at which an offset changed last; s that it took to release, and that it may take.
-
-    NaN: does not apply.
-    """
+    """One fault: s after it at which an offset changed last; s that it took to release, and that it may take. NaN: does
+    not apply."""
 
     held: float
     released: float = math.nan
@@ -293,11 +268,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
-    """Inject each of them so often, and print a line for each.
-
-    How often it held or released later than it must, and the largest step over what the rate
-    allows.
-    """
+    """Inject each of them so often, and print a line for each. How often it held or released later than it must, and
+    the largest step over what the rate allows."""
     late = slow = 0
     worst = 0.0
     campaign = Campaign()

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The faults: what each does to the line, when it is over, and which counter must have seen it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select
@@ -20,17 +18,14 @@ from cobs import cobs
 from bench.campaign.line import Line, hello_of
 from psd_deflection.devices.protocol.frames import encode
 
-Act = Callable[[Line, int], None]
-"""What a fault does to the line, or to the node with that process id."""
+Act = Callable[[Line, int], None]  # What a fault does to the line, or to the node with that process id.
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
     """``act(line, pid)`` returns when the fault is over. ``observed``: diagnostics of which one must have risen.
-
-    ``estimates``: what must come back is the estimate, not the sample. ``back``: the port was away,
-    so the time to recover counts against the second that is allowed.
-    """
+    ``estimates``: what must come back is the estimate, not the sample. ``back``: the port was away, so the time to
+    recover counts against the second that is allowed."""
 
     name: str
     act: Act
@@ -42,8 +37,7 @@ class Fault:
 BAD = ('bad frames',)
 AWAY = ('disconnects',)
 
-STOLEN = 512
-"""Bytes: some of them were samples."""
+STOLEN = 512  # Bytes: some of them were samples.
 
 
 def pause(seconds: float) -> None:

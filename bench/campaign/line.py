@@ -1,12 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A device on a pseudo-terminal with every fault a line can have, and a ledger of what it did to which sample.
-
-Every sample carries its own number (its identity) in the counts of x1 and x2, so that a recording
-tells which samples arrived, whatever numbers and clocks the device made up meanwhile.
-"""
-
-from __future__ import annotations
+"""A device on a pseudo-terminal with every fault a line can have, and a ledger of what it did to which sample."""
 
 import contextlib
 import fcntl
@@ -40,8 +34,7 @@ from psd_deflection.records import CHANNELS
 RATE = 1000
 SERIAL = 'CAMPAIGN-1'
 VOLTS_PER_COUNT = 10.0 / 32768
-DIGIT = 4096
-"""Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1."""
+DIGIT = 4096  # Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1.
 
 LOOK_S = 0.005
 QUIET_LOOKS = 5
@@ -125,11 +118,9 @@ class Line:
             self._terminal = None
 
     def wait_until_read(self) -> int:
-        """Wait until nothing sent is unread at several looks in a row; samples before the returned one are read.
-
-        At one look bytes may be between two of the kernel's buffers, unseen: only what was sent before
-        the first of the looks is sure to be read by the last.
-        """
+        """Wait until nothing sent is unread at several looks in a row; samples before the returned one are read. At one
+        look bytes may be between two of the kernel's buffers, unseen: only what was sent before the first of the looks
+        is sure to be read by the last."""
         deadline, quiet, sure = time.monotonic() + READ_LIMIT_S, 0, 0
         while quiet < QUIET_LOOKS and time.monotonic() < deadline:
             with self.lock:

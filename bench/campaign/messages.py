@@ -1,23 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of any content against every input of the five nodes: no end, no leak, and no step of what moves an arm.
-
-  python -m bench.campaign.messages 1000000 --node compensator
-  python -m bench.campaign.messages --minutes 60
-
-Each node is attacked in a process of its own, all at once. First its process, as a user starts it, gets some over real
-DDS. Then a node in the attacking process gets them through its own callbacks, as DDS would hand them over, at the speed
-of the processor, and what is right between them. The inputs are those to which the node subscribes on the graph: one
-that is not in the table of good messages (``bench.campaign.attacked``) ends the campaign. What is strange follows from
-the types of the fields (``bench.campaign.strange``). Its services are asked the same way: parameters, lifecycle,
-``enable``, ``zero``, ``record``.
-
-Judged: nothing ends the node; what cannot be decoded is counted as rejected; the memory after the first tenth stays; it
-still does what it is there for; no step between two commands is larger than max_rate times the time between them, and
-no trajectory begins elsewhere than the one under way is.
-"""
-
-from __future__ import annotations
+"""Messages of any content against every input of the five nodes: no end, no leak, and no step of what moves an arm."""
 
 import argparse
 import contextlib
@@ -45,24 +28,15 @@ from bench.campaign.attacked import NODES, Attacked, good_of
 from bench.campaign.strange import Stranger
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
-MOST_GROWTH = 30e6
-"""Bytes that the process may grow by after the first tenth."""
-SPIN_EVERY = 50
-"""Messages after which the node's timers have their turn."""
-ASK_EVERY = 500
-"""Messages after which a service is asked."""
-AS_GIVEN_AFTER = 200
-"""Messages after which the parameters that a request has set are set back."""
-ANSWER_S = 30.0
-"""Longest time for the answer of a service, s."""
-PAUSE_S = 0.002
-"""Between two messages over DDS, s."""
-ON_GRAPH = ('/parameter_events', '/rosout')
-"""What ROS itself may subscribe to."""
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Whoever asks for less is served, too."""
-SET_TYPES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 77)
-"""Types of a parameter, and one that is none."""
+MOST_GROWTH = 30e6  # Bytes that the process may grow by after the first tenth.
+SPIN_EVERY = 50  # Messages after which the node's timers have their turn.
+ASK_EVERY = 500  # Messages after which a service is asked.
+AS_GIVEN_AFTER = 200  # Messages after which the parameters that a request has set are set back.
+ANSWER_S = 30.0  # Longest time for the answer of a service, s.
+PAUSE_S = 0.002  # Between two messages over DDS, s.
+ON_GRAPH = ('/parameter_events', '/rosout')  # What ROS itself may subscribe to.
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # Whoever asks for less is served, too.
+SET_TYPES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 77)  # Types of a parameter, and one that is none.
 
 
 class EndedError(Exception):

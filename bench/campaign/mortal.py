@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Work that fails or kills its process, for the tests of many recordings: processes import it by its name."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulated arm on the graph, which may tell of its deflection and of its joints what is not so."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -22,14 +20,12 @@ from psd_deflection.records import FloatArray
 from tools.program import ROOT
 
 NOMINAL = np.array([1.2, 0.6])
-LOAD = (0.0, 0.0, -40.0)
-"""N, at the end effector."""
+LOAD = (0.0, 0.0, -40.0)  # N, at the end effector.
 PERIOD_S = 0.02
 NOISE = 1e-6
 MAX_RATE, FOLLOW_ERROR = CompensatorSettings().max_rate, CompensatorSettings().follow_error
 LATE_S = 0.05
-"""With a longer time between two steps of the arm, the compensator finds rightly that nobody tells
-it anything, s."""
+"""With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
 
 Notify = Callable[[Any], bool]
 
@@ -140,16 +136,12 @@ JOINTS: dict[str, tuple[Notify, str]] = {
 
 
 class Plant:
-    """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its
-    deflection and its joints.
-
-    ``notify`` and ``notify_joints`` may change what it says, and withhold it by False. ``stands``: a
-    protective stop. ``applies``: the controller runs, and tells what it has: ``held``. ``share``: how much of that it
-    adds, whatever it tells. ``droop``, rad: how far its servos leave the joints below their command. ``commands``: it
-    takes commands, not offsets; ``held`` is its command less the nominal one.
-    ``offsets``: all that were heard, and ``stamps`` when they were sent, s. ``late``: whether a
-    step was later than ``LATE_S``.
-    """
+    """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its deflection and its
+    joints. ``notify`` and ``notify_joints`` may change what it says, and withhold it by False. ``stands``: a protective
+    stop. ``applies``: the controller runs, and tells what it has: ``held``. ``share``: how much of that it adds,
+    whatever it tells. ``droop``, rad: how far its servos leave the joints below their command. ``commands``: it takes
+    commands, not offsets; ``held`` is its command less the nominal one. ``offsets``: all that were heard, and
+    ``stamps`` when they were sent, s. ``late``: whether a step was later than ``LATE_S``."""
 
     def __init__(self, node: Any, topic: str = '/end_effector/deflection', joints: str = '/joint_states') -> None:
         self.arm = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, NOMINAL, damping=0.1)

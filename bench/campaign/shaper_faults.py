@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The shaper's part of :mod:`bench.campaign.hold`: what it does when something goes wrong, over real DDS.
-
-The shaper moves a stand-in of joint_trajectory_controller by trajectories that replace each other. A fault comes while
-one is under way: the shaper must reject it, or go on without a step. Judged is the largest step of the command, sampled
-500 times a second, over what the fastest trajectory that was given allows. A trajectory that DDS or a busy machine
-delivers after its begin is joined in its middle: such ones are counted, and the step to them is not the shaper's.
-"""
-
-from __future__ import annotations
+"""The shaper's part of :mod:`bench.campaign.hold`: what it does when something goes wrong, over real DDS."""
 
 import copy
 import math
@@ -31,8 +23,7 @@ from tools.program import PSD_DEFLECTION, Program
 
 NAMES = ('shoulder', 'elbow')
 MOVE_S = 0.6
-LARGEST = 0.4
-"""Of a joint, rad."""
+LARGEST = 0.4  # Of a joint, rad.
 FASTEST = 1.5 * 2.0 * LARGEST / (MOVE_S - 0.1)
 """Of a cubic from one end to the other within the time that is left of it, rad/s."""
 STEP_S = 0.002
@@ -93,11 +84,9 @@ OTHERS = ('replaced again and again', 'joints not told', 'killed and started aga
 
 
 class Moved:
-    """The graph: the shaper, and what it moves.
-
-    ``stamps`` (s) and ``commands`` of the joints; ``late``: the numbers of those before which a trajectory came after
-    its begin. ``heard``: how many came. ``reports``: whether the joints are told.
-    """
+    """The graph: the shaper, and what it moves. ``stamps`` (s) and ``commands`` of the joints; ``late``: the numbers of
+    those before which a trajectory came after its begin. ``heard``: how many came. ``reports``: whether the joints are
+    told."""
 
     def __init__(self) -> None:
         rclpy.init()

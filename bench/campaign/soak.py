@@ -1,29 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make campaign NAME=soak``: the daemon for long, in real time and in simulated time.
-
-Real time: the node with recording and a subscriber, reading a device whose clock runs 30 ppm fast
-over a line that is polled every millisecond, as USB is. Simulated time: the bytes of the same device
-through decoder, sequence numbers, clock map and pipeline as fast as they go (about 100 times real
-time on an idle core), over a wrap of the sample numbers. Both are judged by samples lost, by the
-growth of memory after warm-up, and by the stamps against the simulated truth after three minutes.
-
-With ``--busy N`` the node runs beside N processes that do nothing but compute. Then samples may be missing, and each
-must be counted, under its cause, in the log, in ``/diagnostics`` and in what ``info`` says of the recording.
-
-  python -m bench.campaign.soak --minutes 30 --hours 24
-  python -m bench.campaign.soak --minutes 30 --hours 0 --busy 20
-  python -m bench.campaign.soak --minutes 5 --hours 0 --busy 8 --nice 19
-"""
-
-from __future__ import annotations
+"""``make campaign NAME=soak``: the daemon for long, in real time and in simulated time."""
 
 import contextlib
 import math
 import os
 import random
-import re
-import subprocess
 import sys
 import tempfile
 import threading
@@ -35,7 +17,6 @@ import numpy as np
 
 from bench.campaign.line import hello_of
 from blind.campaign import options
-from msg_adapters import DIAGNOSTICS
 from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import (
     FrameDecoder,
@@ -49,7 +30,6 @@ from psd_deflection.devices.protocol.frames import (
 )
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import IntArray
 from psd_deflection.rig.config import load_rig
@@ -244,58 +224,6 @@ def real_time(minutes: float) -> bool:
         return evaluated('real time', lost, growth, errors)
 
 
-DROPPED = re.compile(r'(\d+) samples were read and not processed \((\d+) while it ran, (\d+) at the end\)')
-
-
-def starved(minutes: float, busy: int, nice: int) -> bool:
-    """The node, at this niceness, beside ``busy`` processes that compute: what is missing is counted, by cause."""
-    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as ends:
-        folder = Path(name)
-        os.environ.setdefault('ROS_DOMAIN_ID', '78')
-        os.environ['XDG_STATE_HOME'] = os.environ['ROS_LOG_DIR'] = name
-        device = PolledDevice(folder)
-        ends.callback(device.close)
-        arguments = ['--port', f'{folder}/port', '--record', str(folder / 'bags')]
-        command = ['nice', '-n', str(nice), *PSD_DEFLECTION, 'estimator', *arguments]
-        node = Program(command, wait_s=START_S)
-        node.until('recording to')
-        for _ in range(busy):
-            loop = subprocess.Popen([sys.executable, '-c', 'while True: pass'])
-            ends.callback(loop.wait)
-            ends.callback(loop.kill)
-        time.sleep(minutes * 60.0)
-        load = os.getloadavg()[0]
-        status, taken = node.end(), device.taken
-        (bag,) = (folder / 'bags').iterdir()
-        return counted(node.text, status, bag, taken, load)
-
-
-def counted(text: str, status: int, bag: Path, taken: int, load: float) -> bool:
-    """Compare the log, ``/diagnostics`` and ``info`` of a starved run with its recording."""
-    recording = open_recording(bag)
-    numbers = np.concatenate([block.seq for block in recording.blocks()])
-    missing = int(numbers[-1] - numbers[0]) + 1 - len(numbers)
-    in_log = DROPPED.search(text)
-    total, running, at_end = (int(n) for n in in_log.groups()) if in_log is not None else (0, 0, 0)
-    values: dict[str, str] = {}
-    for channel, _, message in recording.messages([DIAGNOSTICS]):
-        fields = cdr.decode(channel.type, message)
-        values |= {v['key']: v['value'] for s in fields['status'] for v in s['values']}
-    lost = int(values.get('lost', 0))
-    reported = len(re.findall('samples dropped here so far', text))
-    print(
-        f'load {load:.1f}: {len(numbers)} recorded of {taken} taken, {missing} missing between them; '
-        f'log: {total} dropped ({running} while it ran, {at_end} at the end; {reported} lines); '
-        f'/diagnostics: {values.get("dropped by a full queue")} by a full queue, {lost} lost; '
-        f'info: {recording.dropped_here}; exit status {status}',
-        flush=True,
-    )
-    # Those that were dropped after the last block that is recorded are not between any.
-    good = missing <= running + lost <= missing + taken - int(numbers[-1])
-    good &= recording.dropped_here[0] == total and status == (9 if total else 0) and bool(reported) == bool(running)
-    return good
-
-
 def simulated_time(hours: float) -> bool:
     """Decoder, numbers, clock and pipeline as fast as they go."""
     rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
@@ -351,12 +279,10 @@ def main() -> int:
     parser = options(__doc__)
     parser.add_argument('--minutes', type=float, default=30.0)
     parser.add_argument('--hours', type=float, default=24.0)
-    parser.add_argument('--busy', type=int, default=0, help='processes that compute beside the node')
-    parser.add_argument('--nice', type=int, default=0, help='niceness of the node beside them')
     args = parser.parse_args()
     good = []
     if args.minutes:
-        good.append(starved(args.minutes, args.busy, args.nice) if args.busy else real_time(args.minutes))
+        good.append(real_time(args.minutes))
     if args.hours:
         good.append(simulated_time(args.hours))
     return 0 if all(good) else 1

@@ -1,14 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of any content: a good one, of which some fields have any value that their type allows, and worse ones.
-
-What a field may get follows from its type alone, so that a message of any type can be made strange: numbers that are
-not finite, huge, denormal; stamps before 1970 and ahead of us; texts that are empty, long, or of control characters;
-lists that are empty, huge, or shorter than another one; files of images that are cut, lie about their size, or have
-chunks that nobody needs. Encoded messages are cut and damaged on the way.
-"""
-
-from __future__ import annotations
+"""Messages of any content: a good one, of which some fields have any value that their type allows, and worse ones."""
 
 import random
 import re
@@ -20,8 +12,7 @@ from typing import Any
 from rclpy.serialization import serialize_message
 
 NUMBERS = (float('nan'), float('inf'), -float('inf'), 1e300, -1e308, 5e-324, 1e-200, -0.0, 1e4, 10.0, 1.0, -1.0, 0.0)
-WIDEST = 3.4e38
-"""A float32 is at most this."""
+WIDEST = 3.4e38  # A float32 is at most this.
 TEXTS = (
     '',
     ' ',
@@ -42,10 +33,8 @@ TEXTS = (
     '16UC1',
     'rgba8',
 )
-HUGE = (1000, 5000, 20_000)
-"""Elements of a list that is too long."""
-SHARES = (0.0, 0.0, 0.03, 0.2, 1.0)
-"""Of the fields of a message, how many get another value."""
+HUGE = (1000, 5000, 20_000)  # Elements of a list that is too long.
+SHARES = (0.0, 0.0, 0.03, 0.2, 1.0)  # Of the fields of a message, how many get another value.
 PNG = b'\x89PNG\r\n\x1a\n'
 MAGIC = (
     b'GIF89a',
