@@ -98,7 +98,6 @@ def rms(ran: Ran, window: tuple[float, float]) -> float:
 
 
 def chart(without: Ran, ran: Ran) -> Chart:
-    """Errors and offsets over time."""
     events = ((TAKEN, 'payload'), (ENABLED, 'enabled'), (MOVED, 'move'), (LOST, 'no estimates'), (PUT_DOWN, 'put down'))
     rules = [Rule(t, what) for t, what in events]
     errors = (

@@ -95,7 +95,6 @@ class Clocks:
         stack.append([self.clock(), 0])
 
     def leave(self, part: str) -> None:
-        """It ends."""
         stack = self._inside.stack
         began, within = stack.pop()
         took = self.clock() - began

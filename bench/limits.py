@@ -417,7 +417,6 @@ def verdicts(times: int) -> list[Row]:
 
 
 def main() -> int:
-    """Measure and keep."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--minutes', type=float, default=10.0, help='of the recordings that are replayed and converted')
     parser.add_argument('--seconds', type=float, default=60.0, help='of the recording that discover gets')

@@ -99,7 +99,6 @@ class Arm:
 
 
 def run(*words: str) -> None:
-    """A command that must succeed."""
     subprocess.run(words, check=True, timeout=LONGEST_S)
 
 
@@ -130,7 +129,6 @@ def shaped(arm: Arm, programs: list[Program]) -> None:
 
 
 def move(chance: np.random.Generator) -> JointTrajectory:
-    """To somewhere near."""
     end = np.array([1.2, 0.6]) + chance.uniform(-0.2, 0.2, 2)
     at = Duration(nanoseconds=400_000_000).to_msg()
     point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)

@@ -66,7 +66,6 @@ def soak(minutes: int, rate: float, out: TextIO) -> list[dict[str, int]]:
 
 
 def main() -> int:
-    """Run it and judge."""
     parser = options(__doc__)
     parser.add_argument('--hours', type=float, default=4.0, help='how long (default: 4)')
     parser.add_argument('--rate', type=float, default=1.0, help='times 1000 samples a second (default: 1)')

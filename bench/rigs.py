@@ -31,7 +31,6 @@ class Still:
         self._row = [0, -4000, 10000, 0, -8000, 10000]
 
     def next(self) -> list[int]:
-        """The next sample."""
         self.taken += 1
         return self._row
 

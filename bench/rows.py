@@ -100,7 +100,6 @@ def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
 
 
 def notify(row: Row) -> None:
-    """Print it."""
     print(row.work)
     for f in row.figures:
         words = f'  {f.name:52}{f.median:10.4g} {row.unit}  ({f.low:.4g} to {f.high:.4g}, {f.runs} runs)'

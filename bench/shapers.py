@@ -76,14 +76,12 @@ def rows() -> list[tuple[str, ...]]:
 
 
 def printed(head: Sequence[str], body: Sequence[Sequence[str]]) -> None:
-    """Print a table in Markdown."""
     print('\n| ' + ' | '.join(head) + ' |\n' + '|---' * len(head) + '|')
     for row in body:
         print('| ' + ' | '.join(row) + ' |')
 
 
 def main() -> None:
-    """Print the table."""
     print(f'without a shaper: {1e3 * unshaped():.2f} mm')
     printed(SHAPER_HEAD, rows())
 

@@ -53,7 +53,6 @@ class SimulatedArm:
         self._swing[0], self._swing[1] = self.chain.tips_under(self.force, self.angles.tolist()), 0.0
 
     def end(self) -> EndEffector:
-        """Where the end effector is."""
         return self._composed(self._swing[0])
 
     def vibration(self) -> float:

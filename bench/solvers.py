@@ -15,8 +15,6 @@ from psd_deflection.model.solvers import SOLVERS, Solver, make_solver
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.thesis.comparison import VARIANCES, dots_of, thesis_geometry
 
-STEP = np.radians(0.01)
-
 
 def best_of(action: Callable[[], Any], repeats: int = 5) -> float:
     """Least time, s: the least affected by other work on the machine."""
@@ -69,35 +67,6 @@ def peer_lstsq(dots: FloatArray) -> None:
         np.linalg.lstsq(a, m, rcond=None)
 
 
-def peer_thesis_loop(dots: FloatArray) -> None:
-    """Section 2.2 trial by trial, 0.01 degree each, with numpy's small arrays."""
-    geometry = thesis_geometry()
-    for m in dots:
-        q = geometry.centers + m.reshape(2, 2)
-        for trial in range(401):
-            found = False
-            for theta in (-STEP * trial, STEP * trial):
-                c, s = np.cos(theta), np.sin(theta)
-                delta = geometry.beams - q @ np.array([[c, s], [-s, c]])
-                if (np.abs(delta[0] - delta[1]) < 1e-4).all():
-                    found = True
-                    break
-            if found:
-                break
-
-
-def peer_thesis_at_once(dots: FloatArray) -> None:
-    """The same 401 trials both ways, all of a block's in one array."""
-    geometry = thesis_geometry()
-    theta = STEP * np.arange(-400, 401)
-    c, s = np.cos(theta), np.sin(theta)
-    bx, by = (geometry.beams[0] - geometry.beams[1]).tolist()
-    for m in dots:
-        qx, qy = geometry.centers[0] + m[:2] - geometry.centers[1] - m[2:]
-        hit = (np.abs(bx - c * qx + s * qy) < 1e-4) & (np.abs(by - s * qx - c * qy) < 1e-4)
-        np.abs(np.flatnonzero(hit) - 400).min()
-
-
 def repeat(solver: Solver, dots: tuple[float, ...], variances: tuple[float, ...]) -> None:
     """200 calls of a single block."""
     for _ in range(200):
@@ -105,7 +74,6 @@ def repeat(solver: Solver, dots: tuple[float, ...], variances: tuple[float, ...]
 
 
 def main() -> None:
-    """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--blocks', type=int, default=1_000_000, help='blocks of the vectorised solve')
     blocks = parser.parse_args().blocks
@@ -120,19 +88,13 @@ def main() -> None:
         ('exact, variances of each block, x and y unlike', np.tile((4e-12, 1e-12, 9e-12, 2e-12), (blocks, 1))),
     ):
         seconds[label] = best_of(functools.partial(solver.solve_many, dots, variances), 3) / blocks
-    peers: dict[str, float] = {}
-    for text, peer, count in (
-        ('scipy.optimize.least_squares a block', peer_least_squares, 500),
-        ("the thesis's 0.01 degree loop in numpy", peer_thesis_loop, 100),
-        ('  the same, all trials of a block in one array', peer_thesis_at_once, 5000),
-    ):
-        part = dots[:count]
-        peers[text] = best_of(functools.partial(peer, part), 3) / len(part)
     for label, value in seconds.items():
         print(f'  {label:50} {1e6 * value:9.3f} us a block')
-    default = seconds['exact, one set of variances']
-    for text, value in peers.items():
-        print(f'  {text:50} {1e6 * value:9.1f} us a block, exact is {value / default:.0f} times as fast')
+    peer = best_of(functools.partial(peer_least_squares, dots[:500]), 3) / 500
+    ratio = peer / seconds['exact, one set of variances']
+    print(
+        f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us a block, exact is {ratio:.0f} times as fast'
+    )
 
     print('one block at a time, with covariance')
     one = tuple(dots[0].tolist())
@@ -147,11 +109,11 @@ def main() -> None:
             value = best_of(functools.partial(repeat, solver, one, single)) / 200
             default = default or value
             print(f'  {name + label:50} {1e6 * value:9.1f} us')
-    for text, peer in (
+    for text, by in (
         ('scipy.optimize.least_squares', peer_least_squares),
         ('numpy.linalg.lstsq, linear, no covariance', peer_lstsq),
     ):
-        value = best_of(functools.partial(peer, dots[:200])) / 200
+        value = best_of(functools.partial(by, dots[:200])) / 200
         print(f'  {text:50} {1e6 * value:9.1f} us, exact is {value / default:.0f} times as fast')
 
 

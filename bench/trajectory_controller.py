@@ -52,7 +52,6 @@ class TrajectoryController:
         return self._begins + self._path.duration
 
     def hold(self, now: float) -> None:
-        """Stay where the command is."""
         self._path, self._begins = Trajectory(self._path.names, np.zeros(1), self.state(now)[None, :1]), now
 
     def state(self, now: float) -> FloatArray:

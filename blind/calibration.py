@@ -69,7 +69,6 @@ class Score(NamedTuple):
 
 
 def run_of(recorded: misaligned.Recorded) -> CalibrationRun:
-    """As calibrate takes it."""
     t = np.arange(len(recorded.volts)) / generator.RATE
     return CalibrationRun('blind', t, recorded.volts, t[recorded.frames], recorded.reference)
 
@@ -315,7 +314,6 @@ class Summary(NamedTuple):
 
 
 def summary(scores: Sequence[Score]) -> Summary:
-    """Of all rigs together."""
     z = np.array([list(s.z.values()) for s in scores])
     moved = [s for s in scores if s.moved]
     still = [s for s in scores if not s.moved]
@@ -335,7 +333,6 @@ def summary(scores: Sequence[Score]) -> Summary:
 
 
 def table(scores: Sequence[Score]) -> Iterator[str]:
-    """The printed lines."""
     total = summary(scores)
     yield '| parameter | inside 95 % | rms of error over sd |\n|---|---|---|'
     for name in scores[0].z:
@@ -362,7 +359,6 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the tables of docs/calibration.md."""
     parser = options(__doc__, jobs=2)
     parser.add_argument('--rigs', type=int, default=200)
     parser.add_argument('--light', action='store_true', help='1 to 4 %% of other light, which changes; --dark is used')

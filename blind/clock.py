@@ -114,7 +114,6 @@ def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
 
 
 def main() -> None:
-    """Print the score."""
     parser = options(__doc__)
     parser.add_argument('--runs', type=int, default=200, metavar='N')
     parser.add_argument('--first', type=int, default=1000, metavar='SEED')

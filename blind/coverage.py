@@ -371,7 +371,6 @@ def _job(job: tuple[Row, str]) -> tuple[Row, str, Scored]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table of docs/accuracy.md."""
     parser = options(__doc__, jobs=2)
     parser.add_argument('--rows', type=int, help='only the first kinds of noise, and only the table')
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')

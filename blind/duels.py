@@ -14,11 +14,9 @@ from scipy.optimize import least_squares
 
 from blind.arm import Arm
 from blind.auxtel import PHYSICAL, AuxTel
-from blind.balls import Balls
 from blind.boom import Boom
 from blind.campaign import options
 from blind.emps import Emps
-from blind.silverbox import TESTS, Silverbox, rmse
 from psd_deflection.model.simulation.declaration import Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
@@ -36,7 +34,6 @@ Residual = Callable[[Sequence[Effect], BoolArray], FloatArray]
 
 
 def rms(values: FloatArray) -> float:
-    """Root of the mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -172,14 +169,6 @@ def found_model(found: PlantDiscovery) -> Model:
     return {a.effect.name: dict(a.values) for a in every}
 
 
-def of_silverbox(data: Path, found: Model) -> Iterator[tuple[str, float]]:
-    """Its official tests, each simulated in one piece: error over standard deviation, %."""
-    plant = Silverbox(data / 'silverbox')
-    for name, (first, last) in TESTS.items():
-        simulated = plant.run(found, np.array([first]), last - first)[:, 0]
-        yield f'{name} test, error over standard deviation; %', 100.0 * rmse(plant.y[first:last], simulated)[1]
-
-
 def of_emps(data: Path, found: Model) -> Iterator[tuple[str, float]]:
     """Its test record in one piece without feedback: with what was found, and with the published terms."""
     for words, without, model in (('found', FRICTION, found), ('published', (), {})):
@@ -188,31 +177,21 @@ def of_emps(data: Path, found: Model) -> Iterator[tuple[str, float]]:
         yield f'test record, terms as {words}, rms; m', rms((measured - simulated)[0, EMPS_START:])
 
 
-def of_balls(data: Path, found: Model) -> Iterator[tuple[str, float]]:
-    """The second drop of each ball."""
-    plant = Balls(data / 'falling_balls', 2)
-    for words, model in (('found', found), ('a vacuum', {})):
-        apart = [h - s[0] for h, s in zip(plant.heights, plant.simulate(model), strict=True)]
-        yield f'second drop, terms as {words}, rms of the height; m', rms(np.concatenate(apart))
-
-
 class Duel(NamedTuple):
     """``make``: the machine, of the folder of the data; ``known``: the same with what is published in its model.
-    ``is_linear``: in all terms; None: too large for folds. ``test``: figures on data that no search has."""
+    ``is_linear``: in all terms. ``test``: figures on data that no search has."""
 
     make: Callable[[Path], Plant]
-    is_linear: bool | None = False
+    is_linear: bool = False
     known: Callable[[Path], Plant] | None = None
     test: Callable[[Path, Model], Iterator[tuple[str, float]]] | None = None
 
 
 DUELS: Mapping[str, Duel] = {
     'auxtel': Duel(lambda d: AuxTel(d / 'auxtel.txt'), True, lambda d: AuxTel(d / 'auxtel.txt', known=PHYSICAL[:4])),
-    'silverbox': Duel(lambda d: Silverbox(d / 'silverbox'), None, test=of_silverbox),
     'emps': Duel(lambda d: Emps(FRICTION, d / 'emps'), known=lambda d: Emps((), d / 'emps'), test=of_emps),
     'boom': Duel(lambda d: Boom(d / 'boom'), known=lambda d: Boom(d / 'boom', weighed=True)),
     'arm': Duel(lambda d: Arm(d / 'two_link_arm')),
-    'balls': Duel(lambda d: Balls(d / 'falling_balls'), test=of_balls),
 }
 
 
@@ -249,7 +228,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if not args.null and duel.test is not None:
                 for measure, figure in duel.test(args.data, found_model(found)):
                     print(f'| {name} | {measure} | discover_in | {figure:.3g} |', flush=True)
-            if not args.null and not args.named and duel.is_linear is not None:
+            if not args.null and not args.named:
                 unit = make(args.data).units[0]
                 for way, figure in nested(lambda make=make: make(args.data), duel.is_linear):  # type: ignore[misc]
                     print(f'| {name} | unseen, nested; {unit} | {way} | {figure:.4g} |', flush=True)

@@ -85,7 +85,6 @@ def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
 
 
 def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
-    """discover's result.json."""
     found = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
     return found.tree(), found
 

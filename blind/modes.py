@@ -107,7 +107,6 @@ class Score:
     missed: int = 0
 
     def add(self, found: tuple[Mode, ...], hertz: float, zeta: float) -> None:
-        """Count one rig."""
         if not found or abs(found[0].frequency / hertz - 1.0) > 0.2:
             self.missed += 1
             return
@@ -183,7 +182,6 @@ def scored(seeds: Iterable[int], case: Case, *, pyoma2: bool = False) -> Score:
 
 
 def report(name: str, score: Score) -> str:
-    """Return one line."""
     f, z = np.abs(score.frequency), np.abs(score.damping)
     held = ['', '']
     if score.inside:
@@ -196,7 +194,6 @@ def report(name: str, score: Score) -> str:
 
 
 def main() -> None:
-    """Print the scores."""
     parser = options(__doc__)
     parser.add_argument('--rigs', type=int, default=200, metavar='N')
     parser.add_argument('--first', type=int, default=1000, metavar='SEED')

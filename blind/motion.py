@@ -244,7 +244,6 @@ def _smoothed(run: Run, part: slice) -> Array:
 
 
 def rms(errors: Array) -> float:
-    """Root of the mean square."""
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
@@ -357,7 +356,6 @@ def by_frequency(results: Iterable[Result]) -> list[float]:
 
 
 def table(found: Mapping[str, list[Figures]]) -> str:
-    """Return a Markdown table."""
     rows = [
         '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | predicted | held |',
         '|---' * 10 + '|',
@@ -374,7 +372,6 @@ def table(found: Mapping[str, list[Figures]]) -> str:
 
 
 def main() -> None:
-    """The table."""
     parser = options(__doc__)
     parser.add_argument('--runs', type=int, default=20, help='of each kind of motion')
     parser.add_argument('--seconds', type=float, default=23.0, help='of a run, the first three at rest')

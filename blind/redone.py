@@ -78,7 +78,6 @@ class HeldLoad:
 
     @property
     def name(self) -> str:
-        """Of its files."""
         place = {1: 'sidebar_right', -1: 'sidebar_left', 0: 'link'}[self.side]
         return f'{place}_{self.force:.0f}N'
 

@@ -32,7 +32,6 @@ def truth_of(case: Case) -> list[dict[str, Any]]:
 
 
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
-    """Return the input of discover."""
     rig = load_rig()
     if case.kind == 'hand':
         hand = byhand.drawn(case.design)
@@ -49,7 +48,6 @@ def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
 
 
 def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], Discovery]:
-    """discover's result.json for a case."""
     # A mistake may change the rig, the loads or the length of the recording.
     bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
     observed = observe(case, truth)
@@ -58,7 +56,6 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
 
 
 def _rig(case: Case, observed: Sequence[Observation]) -> Rig:
-    """As its file says."""
     return observed[0].rig if case.mistake[0] else load_rig()
 
 

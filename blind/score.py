@@ -152,7 +152,6 @@ class _Sheet:
         self.passed = True
 
     def check(self, good: bool, text: str) -> None:
-        """One line with a threshold."""
         self.passed = self.passed and good
         self.lines.append(f'  {bound_line(good, " " + text)}')
 

@@ -83,7 +83,6 @@ def table_51() -> list[str]:
 
 
 def main() -> int:
-    """Print both."""
     options(__doc__).parse_args()
     return conclude('\n'.join([*table_b1(), *table_51()]))
 

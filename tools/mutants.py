@@ -55,7 +55,6 @@ class Mutant(NamedTuple):
     occurrence: int
 
     def code(self, text: str) -> str:
-        """The file with the change."""
         return str(mutate_code(text, get_operator('core/' + self.operator)(), self.occurrence))
 
     def words(self, text: str) -> str:
@@ -89,7 +88,6 @@ def copy_of_checkout(folder: Path) -> Path:
 
 
 def mutants_of(file: str, text: str) -> Iterator[Mutant]:
-    """All of a file."""
     lines, tree = text.splitlines(), get_ast(text)
     for name in OPERATORS:
         operator = get_operator('core/' + name)()

@@ -38,7 +38,6 @@ class Table:
             row[node] = YES if report.passed and row.get(node) != NO else NO
 
     def lines(self) -> list[str]:
-        """The table and its notes."""
         nodes = sorted({node for row in self.cells.values() for node in row})
         wide = max(map(len, self.cells), default=0)
         heads = ' '.join(f'{node:^{len(node) + 2}}' for node in nodes)

@@ -34,7 +34,6 @@ def topics() -> str:
 
 
 def commands() -> str:
-    """A row for each command."""
     return _table('command | ', (f'| `{name}` | {summary} |' for name, summary in COMMANDS.items()))
 
 

@@ -68,7 +68,6 @@ class Program:
 
     @property
     def text(self) -> str:
-        """All output so far."""
         return self._output.decode(errors='replace')
 
     @property

@@ -133,7 +133,6 @@ def beside(root: Path) -> Iterator[str]:
 
 
 def main() -> int:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('checkout', nargs='?', type=Path, default=Path())
     root = parser.parse_args().checkout.resolve()

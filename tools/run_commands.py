@@ -91,14 +91,13 @@ SHORTER = {
     r'^python -m bench\.cpu$': '--seconds 2',
     r'^python -m bench\.rigs$': '--seconds 1 --most 2',
     r'^python -m bench\.first_look --times \d+$': '--times 1',
-    r'^python -m tools\.shots --widths$': '--seconds 5',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""
 
 TOOLS = {
     r'^make demo NAME=firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
-    r'^make (docs STEP=shots|campaign NAME=page-soak)|first_look|tools\.shots': ('chromium', 'chromedriver'),
+    r'^make (docs STEP=shots|campaign NAME=page-soak)|first_look': ('chromium', 'chromedriver'),
     r'^curl ': ('curl',),
     r'^ros2 ': ('ros2',),
 }
@@ -384,7 +383,6 @@ class Reader:
             time.sleep(0.25)
 
     def close(self) -> None:
-        """Pull the plug."""
         if self._device is not None:
             self._device.end()
 

@@ -58,13 +58,11 @@ class Watch:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> Iterator[None]:
-        """Before a test."""
         self._into = self._fixtures.setdefault(item.nodeid.partition('::')[0], {})
         return (yield)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
-        """A test."""
         self._into = self._tests.setdefault(item.nodeid, {})
         begun = time.monotonic()
         try:
@@ -73,7 +71,6 @@ class Watch:
             self._seconds[item.nodeid] = time.monotonic() - begun
 
     def observed(self) -> str:
-        """The tests as JSON."""
         sys.settrace(None)
         here = str(Path.cwd()) + os.sep
         out = {}
@@ -153,7 +150,6 @@ def chosen(tests: dict[str, Test], file: str, first: int) -> list[str]:
 
 
 def main() -> None:
-    """Answer until the input ends."""
     os.environ['PYTEST_DISABLE_PLUGIN_AUTOLOAD'] = '1'
     # test/conftest.py reads it.
     os.environ['PSD_DEFLECTION_MUTANTS'] = '1'

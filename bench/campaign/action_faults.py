@@ -41,7 +41,6 @@ class Followed(Moved):
         self._served = ServedController(self.node, NAMES, self.controller)
 
     def started(self) -> Program:
-        """As of the topic."""
         words = ['--frequency', '12', '--shaper', 'zvd', '--action', ACTION]
         out = Program([*PSD_DEFLECTION, 'shaper', *words])
         out.until('publishing /shaper/shaped')
@@ -58,7 +57,6 @@ class Followed(Moved):
         super()._step()
 
     def give(self, message: Any) -> None:
-        """Send a goal."""
         self._sent.append(self._client.send_goal_async(self._goal(trajectory=message)))
 
     def _ended(self) -> None:

@@ -53,7 +53,6 @@ Good = Callable[[], Any]
 
 
 def now() -> Any:
-    """The stamp of now."""
     sec, nanosec = divmod(time.time_ns(), 10**9)
     return Time(sec=sec, nanosec=nanosec)
 
@@ -82,7 +81,6 @@ def _covered(frame: str) -> Any:
 
 
 def deflection() -> Any:
-    """Of the end effector."""
     return _covered('end_effector_rest')
 
 
@@ -92,7 +90,6 @@ def _reference() -> Any:
 
 
 def joints() -> Any:
-    """Where they are."""
     return _stamped(JointState(name=list(NAMES), position=list(JOINTS)))
 
 
@@ -115,20 +112,17 @@ class _Pictures:
 
     @property
     def grey(self) -> Any:
-        """Its rows."""
         if 'grey' not in self._files:
             self._files['grey'] = photograph(self.scene, [Pose()], np.random.default_rng(0)).tobytes()
         return np.frombuffer(self._files['grey'], np.uint8).reshape(self.scene.height, self.scene.width)
 
     def image(self) -> Any:
-        """As a camera sends it."""
         rows = self.grey
         out = Image(height=rows.shape[0], width=rows.shape[1], encoding='mono8', step=rows.shape[1])
         out.data = rows.tobytes()
         return _stamped(out)
 
     def compressed(self) -> Any:
-        """As a file."""
         kind = ('png', 'jpeg')[time.monotonic_ns() // 1000 % 2]
         if kind not in self._files:
             self._files[kind] = opencv().imencode(f'.{kind}', self.grey)[1].tobytes()
@@ -209,7 +203,6 @@ class Attacked(ABC):
             self.hand(topic, serialize_message(GOOD[topic]()))
 
     def close(self) -> None:
-        """Leave."""
         self.owner.close()
 
 
@@ -246,11 +239,9 @@ class Estimator(Attacked):
         return sum(s.rejected.total() + s.processing.requests_dropped for s in self._sessions())
 
     def faults(self) -> list[str]:
-        """It must still measure."""
         return _measured(self._sessions(), 100)
 
     def summary(self) -> str:
-        """What was measured."""
         return f'{sum(s.pipeline.counters.estimates for s in self._sessions())} estimates'
 
 
@@ -277,11 +268,9 @@ class Chain(Attacked):
         return super().rejected() + sum(s.rejected.total() + s.processing.requests_dropped for s in self._sessions())
 
     def faults(self) -> list[str]:
-        """It must still measure."""
         return _measured(self._sessions(), 100)
 
     def summary(self) -> str:
-        """What was measured and composed."""
         composed = self._node.chain.composed if self._node.chain is not None else 0
         return f'{composed} end effectors composed'
 
@@ -300,7 +289,6 @@ class Camera(Attacked):
         self._answers += 1
 
     def right(self) -> None:
-        """An image."""
         self.give('/image')
 
     def faults(self) -> list[str]:
@@ -308,7 +296,6 @@ class Camera(Attacked):
         return [] if self._answers else ['no image was answered']
 
     def summary(self) -> str:
-        """What was answered."""
         return f'{self._answers} answers'
 
 

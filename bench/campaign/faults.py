@@ -89,7 +89,6 @@ class Witness:
 
 
 def inject(row: Row, line: Line, witness: Witness, pid: int) -> None:
-    """One injection and its verdict."""
     fault = row.fault
     before = witness.counters
     first = line.next_identity()

@@ -106,7 +106,6 @@ class Killer:
                 self.killed.append(pid)
 
     def end(self) -> None:
-        """Kill no more."""
         self._given_up.set()
         self._thread.join()
 

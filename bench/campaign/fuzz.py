@@ -132,7 +132,6 @@ def bag_target() -> tuple[Target, list[bytes]]:
 
 
 def csv_target() -> tuple[Target, list[bytes]]:
-    """A CSV recording."""
     from psd_deflection.recordings.read.readers import open_recording
 
     seed = b't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz\n'
@@ -177,7 +176,6 @@ class Choices:
         return self._at < len(self._content)
 
     def take(self, size: int) -> bytes:
-        """The next bytes."""
         piece = self._content[self._at : self._at + size]
         self._at += size
         return piece.ljust(size, b'\0')

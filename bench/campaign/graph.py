@@ -91,7 +91,6 @@ class Graph:
         self.node.destroy_client(client)
 
     def close(self) -> None:
-        """End everything."""
         self.compensator.end()
         self.executor.shutdown()
         self.node.destroy_node()

@@ -78,13 +78,11 @@ class Relay:
             self._process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
-        """Kill it."""
         self._process.kill()
         self._process.wait()
 
 
 def relay(name: str) -> None:
-    """Pass messages on until killed."""
     heard, reported, kind = RELAYED[name]
     rclpy.init()
     node = rclpy.create_node(f'stands_for_the_{name}')
@@ -152,7 +150,6 @@ class Campaign(Graph):
         return out, late
 
     def _begin(self, name: str) -> Callable[[], None]:
-        """Do it; what undoes it."""
         plant = self.plant
         if name in SENT:
             number, victims = SENT[name]
@@ -233,7 +230,6 @@ class Campaign(Graph):
         return float(stamps[after][moved][0]) if moved.any() else math.inf
 
     def close(self) -> None:
-        """End everything."""
         for one in self.relays.values():
             one.close()
         super().close()

@@ -69,8 +69,6 @@ def _changed(change: Callable[[Line, bytes], bytes | None], seconds: float) -> A
 
 
 def _once(change: Callable[[Line, bytes], bytes]) -> Act:
-    """Change one frame."""
-
     def act(line: Line, pid: int) -> None:
         first = iter((change,))
 
@@ -84,8 +82,6 @@ def _once(change: Callable[[Line, bytes], bytes]) -> Act:
 
 
 def _injected(make: Callable[[Line], bytes], seconds: float = 0.03) -> Act:
-    """Bytes between two frames."""
-
     def act(line: Line, pid: int) -> None:
         line.inject(make(line))
         pause(seconds)

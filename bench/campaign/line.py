@@ -149,7 +149,6 @@ class Line:
         return self._terminal.name if self._terminal is not None else ''
 
     def restart(self, seq: int = 0, clock_us: int = 0) -> None:
-        """The device starts anew."""
         with self.lock:
             self._seq, self._clock_us = seq, clock_us
 
@@ -160,7 +159,6 @@ class Line:
             self._clock_us += clock_us
 
     def inject(self, garbage: bytes) -> None:
-        """Bytes between two frames."""
         with self.lock:
             self._pending += garbage
 
@@ -175,7 +173,6 @@ class Line:
             return self.sent
 
     def close(self) -> None:
-        """End."""
         self._stop.set()
         self._thread.join()
         if self._terminal is not None:

@@ -166,7 +166,6 @@ class Inside:
             raise EndedError(f'{service.service_name}: {task.exception()!r}: {request}'[:3000])
 
     def spin(self) -> None:
-        """Let timers have their turn."""
         try:
             for _ in range(4):
                 self._executor.spin_once(timeout_sec=0.0)
@@ -197,7 +196,6 @@ class Inside:
         return memory() - begun
 
     def reported(self) -> str:
-        """How far it is."""
         return (
             f'{self.number} messages on {len(self.sent)} inputs and {self.asked} requests, '
             f'{self.attacked.rejected()} rejected of which {self.undecodable} could not be decoded, '
@@ -205,7 +203,6 @@ class Inside:
         )
 
     def close(self) -> None:
-        """Leave."""
         self.attacked.close()
         self._executor.shutdown()
         rclpy.try_shutdown()

@@ -31,12 +31,10 @@ Notify = Callable[[Any], bool]
 
 
 def faithful(message: Any) -> bool:
-    """What is right."""
     return True
 
 
 def silent(message: Any) -> bool:
-    """Nothing."""
     return False
 
 
@@ -72,7 +70,6 @@ def denormal(message: Any) -> bool:
 
 
 def elsewhere(message: Any) -> bool:
-    """A deflection in another frame."""
     message.header.frame_id = 'world'
     return True
 
@@ -84,7 +81,6 @@ def certain(message: Any) -> bool:
 
 
 def uncertain(message: Any) -> bool:
-    """A covariance of metres."""
     message.pose.covariance = np.eye(6).ravel()
     return True
 
@@ -107,7 +103,6 @@ def leaps(message: Any) -> bool:
 
 
 def far(message: Any) -> bool:
-    """Joints that are nowhere."""
     message.position = [1e300 for _ in message.position]
     return True
 

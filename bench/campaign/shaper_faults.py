@@ -195,7 +195,6 @@ class Moved:
         self.spin(1.5)
 
     def close(self) -> None:
-        """End everything."""
         self.shaper.end()
         self.executor.shutdown()
         self.node.destroy_node()

@@ -98,7 +98,6 @@ class PolledDevice:
                 pending = pending[os.write(self.port.master, pending) :]
 
     def close(self) -> None:
-        """End."""
         self._stop.set()
         self._thread.join()
         self.port.close()
@@ -111,19 +110,16 @@ class RunningDeviation:
         self.count = self.total = self.squares = 0
 
     def add(self, value: int) -> None:
-        """One more."""
         self.count += 1
         self.total += value
         self.squares += value * value
 
     @property
     def mean(self) -> float:
-        """NaN where there is none."""
         return self.total / self.count if self.count else math.nan
 
     @property
     def std(self) -> float:
-        """NaN where there is none."""
         # Whole numbers to the end: the squares of a day would cancel in floating point.
         square = self.count * self.squares - self.total**2
         return math.sqrt(square) / self.count if self.count else math.nan
@@ -169,7 +165,6 @@ def sample_frames(seq: IntArray, t_us: IntArray, counts: IntArray) -> bytes:
 
 
 def real_time(minutes: float) -> bool:
-    """The node in real time."""
     import rclpy
     from geometry_msgs.msg import PoseStamped
 
