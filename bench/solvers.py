@@ -92,9 +92,7 @@ def main() -> None:
         print(f'  {label:50} {1e6 * value:9.3f} us a block')
     peer = best_of(functools.partial(peer_least_squares, dots[:500]), 3) / 500
     ratio = peer / seconds['exact, one set of variances']
-    print(
-        f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us a block, exact is {ratio:.0f} times as fast'
-    )
+    print(f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us, exact is {ratio:.0f} times as fast')
 
     print('one block at a time, with covariance')
     one = tuple(dots[0].tolist())

@@ -26,6 +26,7 @@ from psd_deflection.studies.discover.trees import size_of
 DATA = Path(os.environ.get('PSD_FOREIGN_DATA', 'PSD_FOREIGN_DATA is not set'))
 GROUPS = 11  # Folds into which the parts of a plant are dealt in turn, at most.
 THRESHOLDS = np.geomspace(1e-2, 1.0, 25)  # Of STLSQ, in units of the largest contribution of a term.
+RIDGE = 1e-4  # Of STLSQ, in units of the mean square of a term.
 EMPS_S, EMPS_START = 24.84, 2  # s of a record, simulated in one piece; readings at its start that do not count.
 FRICTION = ('coulomb_friction', 'force_offset')
 BoolArray = npt.NDArray[np.bool_]
@@ -114,8 +115,9 @@ def stlsq(plant: Plant, y: FloatArray, observed: BoolArray) -> FloatArray:
         sizes = np.zeros(table.shape[1])
         for _ in range(20):
             sizes[:] = 0.0
-            sizes[keep] = np.linalg.lstsq(table[observed][:, keep], (y - nothing)[observed], rcond=1e-8)[0]
-            less = np.abs(sizes) >= threshold * np.abs(sizes).max()
+            a, b = table[observed][:, keep], (y - nothing)[observed]
+            sizes[keep] = np.linalg.solve(a.T @ a + RIDGE * count * np.eye(a.shape[1]), a.T @ b)
+            less = np.abs(sizes) >= threshold * np.abs(sizes[always:]).max()
             less[:always] = True
             if np.array_equal(less & keep, keep):
                 break
