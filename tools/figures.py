@@ -67,9 +67,9 @@ def _arrow(ax: Any, start: tuple[float, float], end: tuple[float, float], color:
     ax.add_patch(FancyArrowPatch(start, end, arrowstyle='-|>', mutation_scale=12, color=color, **options))
 
 
-@plt.rc_context({'figure.dpi': 110, 'font.size': 9})
 def sign_convention(target: str) -> None:
     """Plate, PSDs and beams, and the positive direction of each quantity."""
+    plt.rcParams.update({'figure.dpi': 110, 'font.size': 9})
     figure, (front, side, top) = plt.subplots(1, 3, figsize=(9.6, 4.2), width_ratios=(1.35, 1, 1), layout='constrained')
     for ax in (front, side, top):
         ax.set_aspect('equal')
