@@ -19,9 +19,8 @@ from PIL import Image
 
 import psd_deflection
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.write.rerun_writer import APPLICATION, POSE, TIMELINE, blueprint
+from psd_deflection.recordings.write.rerun_writer import APPLICATION, POSE, TIMELINE
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.rig.config import Rig, rig_from_values
 from tools.program import Program
 
 BIN = Path(sys.executable).parent
@@ -30,7 +29,6 @@ VIEWER_S = 180.0
 LIGHT = (255, 80, 60)
 SHARE = 5e-4
 """Minimum share of pixels in a trace's colour (measured: 2e-3); an empty viewport has a few, from its icons."""
-FIGURE_SPEED = 4.0  # Playback speed: slow enough that nothing has moved when the picture is taken.
 
 
 def need(true: bool, what: str) -> None:
@@ -93,40 +91,6 @@ def check_poses(written: Written, recording: Recording) -> int:
     return breaks
 
 
-def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
-    """Check that there is a dot of exactly the blocks with light, and that it lies among the samples of its block."""
-    samples = recording.samples
-    _, first = np.unique(samples['seq'] // recording.block_size, return_index=True)
-    present = np.diff([*first, len(samples)])
-    for n in (1, 2):
-        light = np.add.reduceat(samples[f'sum{n}'].astype(np.float64), first) / present
-        observed = light >= rig.estimator.sum_min
-        low, high = (
-            1e3
-            * np.stack(
-                [
-                    extreme.reduceat(samples[f'{axis}{n}'].astype(np.float64), first) * sensitivity
-                    for axis, sensitivity in zip('xy', rig.sensitivities[n - 1], strict=True)
-                ],
-                axis=-1,
-            )[observed]
-            for extreme in (np.minimum, np.maximum)
-        )
-        _, _, found = written.rows(f'psd_{n}/plane/dot', 'Points2D:positions')
-        need(len(found) == int(observed.sum()), f'PSD {n}: {len(found)} dots, {observed.sum()} blocks with light')
-        # The dot in the middle of a whole block lies among its samples, or next to them; float32 in the file.
-        slack = high - low + 1e-5
-        apart = ((found < low - slack) | (found > high + slack)).any(axis=1) & (
-            present[observed] == recording.block_size
-        )
-        need(not apart.any(), f'PSD {n}: {int(apart.sum())} dots lie apart from their samples')
-        _, _, sums = written.rows(f'sums/psd_{n}', 'Scalars:scalars')
-        need(np.allclose(sums, light, rtol=1e-6), f'sum{n} differs')
-    _, _, lost = written.rows('lost', 'Scalars:scalars')
-    full = recording.block_size
-    need(int(lost[lost < full].sum()) == int((full - present).sum()), 'the count of lost samples differs')
-
-
 def picture(files: list[Path], target: Path) -> bool:
     """Take a picture of ``files`` in the viewer on a virtual screen; False if that is not possible."""
     missing = shutil.which('xvfb-run') is None or not list(Path('/usr/share/vulkan/icd.d').glob('*.json'))
@@ -163,10 +127,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recordings', metavar='REC', nargs='+', type=Path)
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='where the .rrd go')
-    parser.add_argument('--figure', metavar='PNG', type=Path, help='make the figure of the documents, too')
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    target, rig = Path(), rig_from_values({}, '')
+    target = Path()
     for path in args.recordings:
         target = args.out / f'{path.stem}.rrd'
         target.unlink(missing_ok=True)
@@ -175,23 +138,13 @@ def main() -> int:
         seconds = time.monotonic() - began
         subprocess.run([BIN / 'rerun', 'rrd', 'verify', target], check=True, capture_output=True)
         recording, written = psd_deflection.open(path), Written(target)
-        rig = rig_from_values(recording.parameters, str(path))
         breaks = check_poses(written, recording)
-        check_dots(written, recording, rig)
         size = target.stat().st_size
-        print(f'  as recorded: poses, bands, dots, sums, losses; {breaks} breaks; {size} bytes, {seconds:.1f} s')
+        print(f'  as recorded: poses and bands; {breaks} breaks; {size} bytes, {seconds:.1f} s')
     shot = args.out / 'shot.png'
     if picture([target], shot):
         check_picture(shot)
         print(f'  the viewer shows {target}: {shot}')
-    if args.figure is not None:
-        faster = args.out / 'faster.rbl'
-        blueprint(rig, FIGURE_SPEED).save(APPLICATION, faster)
-        if picture([target, faster], shot):
-            check_picture(shot)
-            small = Image.open(shot).convert('RGB').resize((1500, 900), Image.Resampling.LANCZOS)
-            small.quantize(256, Image.Quantize.MAXCOVERAGE).save(args.figure, optimize=True)
-            print(f'  {args.figure}: {args.figure.stat().st_size} bytes')
     print('all is as it should be')
     return 0
 

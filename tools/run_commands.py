@@ -97,7 +97,7 @@ SHORTER = {
 
 TOOLS = {
     r'^make demo NAME=firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
-    r'^make (docs STEP=shots|campaign NAME=page-soak)|first_look': ('chromium', 'chromedriver'),
+    r'^make docs STEP=shots|first_look': ('chromium', 'chromedriver'),
     r'^curl ': ('curl',),
     r'^ros2 ': ('ros2',),
 }

@@ -43,7 +43,11 @@ CAMPAIGNS = {
         'faults of compensator and shaper, each 20 times (30 min)',
         '--times 1 --only silent',
     ),
-    'nodes': Task('python -m tools.nodes', 'what every ROS node does alike (5 min)', '-k unknown_parameter'),
+    'nodes': Task(
+        'python -m pytest -q -rs test/ros/test_conformance.py',
+        'what every ROS node does alike (5 min)',
+        '-k unknown_parameter',
+    ),
     'crash': Task(
         'python -m bench.campaign.crash', 'kill -9 while recording, 200 times (8 min)', '--times 1', r'\d+ kills: '
     ),
@@ -58,17 +62,6 @@ CAMPAIGNS = {
         '30 minutes in real time, 24 hours of simulated time (1 h)',
         '--minutes 0.05 --hours 0.05',
         r'real time: \d+ samples lost',
-    ),
-    'page-soak': Task(
-        'python -m bench.page_soak',
-        'the heap of the live page, every minute (4 h)',
-        '--hours 0.02',
-        'too short to tell',
-    ),
-    'fleet': Task(
-        'python -m bench.campaign.fleet',
-        '1000 recordings through Dask clusters whose workers are killed (10 min)',
-        '--recordings 8 --seconds 0.2 --kills 1 --only-killed',
     ),
     'camera': Task(
         'python -m bench.campaign.camera',

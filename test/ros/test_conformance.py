@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What every node does alike: a row a check, a column a node. ``make campaign NAME=nodes`` prints the table.
+"""What every node does alike: for ``make campaign NAME=nodes``.
 
 The nodes are those executables of `ros2 run` whose command uses rclpy. A new one has no profile, and fails every check.
 A profile says what a node is asked with; a text in its place says why the check does not apply, and is in the table.
