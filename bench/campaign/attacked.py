@@ -21,7 +21,7 @@ from std_msgs.msg import Bool, Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from bench.steps import largest_step
+from bench.simulated_arm import largest_step
 from blind.render import Pose, Scene, photograph
 from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
 from psd_deflection.arms.compensation.compensator import State

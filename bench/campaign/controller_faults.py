@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.campaign.graph import LONGEST_S, Graph
-from bench.campaign.plant import LOAD, MAX_RATE
+from bench.campaign.plant import LOAD, LONGEST_S, MAX_RATE, Graph
 
 HOLDS_S = 10.0  # The compensator must find a wrong sign or scale within this time of its enabling, s.
 RELEASE_S = 0.5

@@ -18,11 +18,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 
-from bench.campaign.action_faults import action_faults
 from bench.campaign.controller_faults import CONTROLLER_FAULTS, controller_faults
-from bench.campaign.graph import LONGEST_S, Graph
-from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, MAX_RATE, faithful
-from bench.campaign.shaper_faults import shaper_faults
+from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, LONGEST_S, MAX_RATE, Graph, faithful
+from bench.campaign.shaper_faults import action_faults, shaper_faults
 from blind.campaign import conclude, options
 from psd_deflection.ros.running import TRANSPORTS
 from tools.program import ROOT

@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import SetBool
 
-from bench.campaign.graph import BREAKS, URDF
+from bench.campaign.plant import BREAKS, URDF
 from bench.campaign.hold import WITHIN
 from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful
 from test.ros.conftest import WARNINGS

@@ -14,8 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.simulated_arm import SimulatedArm
-from bench.steps import largest_step
+from bench.simulated_arm import SimulatedArm, largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm

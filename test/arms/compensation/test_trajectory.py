@@ -15,7 +15,7 @@ from scipy.interpolate import BPoly
 from scipy.signal import lsim
 
 from bench import shapers
-from bench.steps import largest_step_in_time
+from bench.simulated_arm import largest_step_in_time
 from bench.trajectory_controller import TrajectoryController
 from psd_deflection.arms.compensation.arm import JointLimits, read_limits
 from psd_deflection.arms.compensation.trajectory import MovingError, Trajectory, TrajectoryShaper, checked, start_of
