@@ -14,41 +14,21 @@ from psd_deflection.studies.discover.observation import Observation
 
 LENGTH = 0.585  # m, of the rig file.
 
+AXES = {1: [1, 0, 2, 3, 4, 5], 2: [0, 1, 2, 4, 3, 5]}
 Make = Callable[[float, Observation, np.random.Generator], list[Observation]]
 
 
-def _volts(o: Observation, volts: Array) -> list[Observation]:
-    return [dataclasses.replace(o, volts=volts)]
+def _of(o: Observation, **changes: Any) -> list[Observation]:
+    return [dataclasses.replace(o, **changes)]
 
 
-def _sign(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    signs = np.ones(6)
-    signs[int(size)] = -1.0
-    return _volts(o, o.volts * signs)
+def _signs(count: int, size: float) -> Array:
+    """(count,) of 1, with -1 at the place ``size``."""
+    return np.where(np.arange(count) == int(size), -1.0, 1.0)
 
 
-def _axes(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    order = [1, 0, 2, 3, 4, 5] if size == 1.0 else [0, 1, 2, 4, 3, 5]
-    return _volts(o, o.volts[:, order])
-
-
-def _psds(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    return _volts(o, o.volts[:, [3, 4, 5, 0, 1, 2]])
-
-
-def _load_sign(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    signs = np.ones(3)
-    signs[int(size)] = -1.0
-    return [dataclasses.replace(o, loads=o.loads * signs)]
-
-
-def _unit(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    return [dataclasses.replace(o, loads=o.loads / np.array([size, size, 1.0]))]
-
-
-def _delay(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    at = np.clip(np.arange(len(o.loads)) - round(size / o.period), 0, len(o.loads) - 1)
-    return [dataclasses.replace(o, loads=o.loads[at])]
+def _delayed(size: float, o: Observation) -> Array:
+    return np.asarray(o.loads[np.clip(np.arange(len(o.loads)) - round(size / o.period), 0, len(o.loads) - 1)])
 
 
 def _rig(name: str) -> Make:
@@ -58,7 +38,7 @@ def _rig(name: str) -> Make:
         true = o.rig.values[name]
         if not isinstance(true, float):
             raise TypeError(f'{name} = {true!r}: must be a number')
-        return [dataclasses.replace(o, rig=replace_values(o.rig, {name: true / size}))]
+        return _of(o, rig=replace_values(o.rig, {name: true / size}))
 
     return make
 
@@ -78,21 +58,17 @@ def _zero(size: float, o: Observation, rng: np.random.Generator) -> list[Observa
     ]
 
 
-def _noise(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    return [dataclasses.replace(o, rig=replace_values(o.rig, {'amplifier.noise': o.rig.amplifier.noise / size}))]
-
-
 def _coverage(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
     loads, first = o.loads.copy(), round(size * len(o.loads))
     loads[:first] = 0.0
-    return [dataclasses.replace(o, loads=loads, unknown_load=(first, 0))]
+    return _of(o, loads=loads, unknown_load=(first, 0))
 
 
 def _stuck(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
     volts, channel = o.volts.copy(), int(rng.choice((0, 1, 3, 4)))
     start = int(rng.uniform(0.1, 0.6) * len(volts))
     volts[start : start + round(size / o.period), channel] = volts[start, channel]
-    return _volts(o, volts)
+    return _of(o, volts=volts)
 
 
 def _jump(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
@@ -100,42 +76,36 @@ def _jump(size: float, o: Observation, rng: np.random.Generator) -> list[Observa
     start = int(rng.uniform(0.2, 0.8) * len(volts))
     along = np.array([np.cos(turn), np.sin(turn)]) * size / o.rig.amplifier.sensitivity
     volts[start:, 3 * psd : 3 * psd + 2] += along
-    return _volts(o, volts)
-
-
-def _gaps(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    volts = o.volts.copy()
-    volts[rng.random(len(volts)) < size] = np.nan
-    return _volts(o, volts)
+    return _of(o, volts=volts)
 
 
 def _outliers(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
     bad = rng.random(o.volts.shape) < size
-    return _volts(o, np.where(bad, rng.uniform(-10.0, 10.0, bad.shape), o.volts))
+    return _of(o, volts=np.where(bad, rng.uniform(-10.0, 10.0, bad.shape), o.volts))
 
 
 def _under_load(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
     first = int(rng.uniform(0.05, 0.2) * len(o.volts))
     warm = None if o.temperature is None else np.full(len(o.volts) - first, 21.0)
-    return [dataclasses.replace(o, volts=o.volts[first:], loads=o.loads[first:], temperature=warm)]
+    return _of(o, volts=o.volts[first:], loads=o.loads[first:], temperature=warm)
 
 
 MAKE: Mapping[str, Make] = {
-    'channel_sign': _sign,
-    'axis_swap': _axes,
-    'psd_swap': _psds,
-    'load_sign': _load_sign,
-    'load_unit': _unit,
-    'load_delay': _delay,
+    'channel_sign': lambda size, o, rng: _of(o, volts=o.volts * _signs(6, size)),
+    'axis_swap': lambda size, o, rng: _of(o, volts=o.volts[:, AXES[int(size)]]),
+    'psd_swap': lambda size, o, rng: _of(o, volts=o.volts[:, [3, 4, 5, 0, 1, 2]]),
+    'load_sign': lambda size, o, rng: _of(o, loads=o.loads * _signs(3, size)),
+    'load_unit': lambda size, o, rng: _of(o, loads=o.loads / np.array([size, size, 1.0])),
+    'load_delay': lambda size, o, rng: _of(o, loads=_delayed(size, o)),
     'sensitivity': _rig('amplifier.sensitivity'),
     'link_length': _rig('link.length'),
     'sample_rate': _rig('converter.sample_rate_hz'),
     'zero': _zero,
-    'noise_level': _noise,
+    'noise_level': _rig('amplifier.noise'),
     'load_coverage': _coverage,
     'stuck_channel': _stuck,
     'jump': _jump,
-    'gaps': _gaps,
+    'gaps': lambda size, o, rng: _of(o, volts=np.where(rng.random((len(o.volts), 1)) < size, np.nan, o.volts)),
     'outliers': _outliers,
     'under_load': _under_load,
 }

@@ -36,6 +36,7 @@ Notify = Callable[[Any], bool]
 
 
 def faithful(message: Any) -> bool:
+    """What is right."""
     return True
 
 
@@ -43,51 +44,19 @@ def silent(message: Any) -> bool:
     return False
 
 
-def no_number(message: Any) -> bool:
-    """A deflection that is not finite."""
-    message.pose.pose.position.x = math.nan
-    return True
+def wrong(field: str, *values: Any, added: bool = False) -> Notify:
+    """``field``, or each of its parts x, y, z, w, has another value, or ``added`` to what it had."""
 
+    def changed(message: Any) -> bool:
+        *path, last = field.split('.')
+        for name in path:
+            message = getattr(message, name)
+        for part, value in zip('xyzw' if len(values) > 1 else (last,), values, strict=False):
+            owner = getattr(message, last) if len(values) > 1 else message
+            setattr(owner, part, getattr(owner, part) + value if added else value)
+        return True
 
-def jumps(message: Any) -> bool:
-    """A deflection that is somewhere else."""
-    message.pose.pose.position.x += 0.1
-    return True
-
-
-def huge(message: Any) -> bool:
-    """A deflection that no link survives."""
-    message.pose.pose.position.z = 1e300
-    return True
-
-
-def ten_metres(message: Any) -> bool:
-    """A deflection that is larger than the arm."""
-    message.pose.pose.position.z = 10.0
-    return True
-
-
-def denormal(message: Any) -> bool:
-    """A rotation whose norm is zero in floating point."""
-    q = message.pose.pose.orientation
-    q.x, q.y, q.z, q.w = 0.0, 0.0, 0.0, 1e-200
-    return True
-
-
-def elsewhere(message: Any) -> bool:
-    message.header.frame_id = 'world'
-    return True
-
-
-def certain(message: Any) -> bool:
-    """A covariance of zeros, which is ROS's word for an unknown one."""
-    message.pose.covariance = np.zeros(36)
-    return True
-
-
-def uncertain(message: Any) -> bool:
-    message.pose.covariance = np.eye(6).ravel()
-    return True
+    return changed
 
 
 def by_seconds(seconds: float) -> Notify:
@@ -107,32 +76,27 @@ def leaps(message: Any) -> bool:
     return True
 
 
-def far(message: Any) -> bool:
-    message.position = [1e300 for _ in message.position]
-    return True
-
-
+PLACE = 'pose.pose.position'
 DEFLECTIONS: dict[str, tuple[Notify, str]] = {
-    'not finite': (no_number, 'not finite'),
-    'jump': (jumps, 'jumps by'),
+    'not finite': (wrong(f'{PLACE}.x', math.nan), 'not finite'),
+    'jump': (wrong(f'{PLACE}.x', 0.1, added=True), 'jumps by'),
     'stale': (by_seconds(-1.0), 'is older than'),
     'silent': (silent, 'no deflection for'),
-    '1e300': (huge, 'more than the links can have'),
-    'ten metres': (ten_metres, 'more than the links can have'),
-    'denormal quaternion': (denormal, 'no deflection for'),
-    'wrong frame': (elsewhere, 'no deflection for'),
-    'zero covariance': (certain, 'does not say how certain'),
-    'covariance of metres': (uncertain, 'uncertain by more than'),
+    '1e300': (wrong(f'{PLACE}.z', 1e300), 'more than the links can have'),
+    'ten metres': (wrong(f'{PLACE}.z', 10.0), 'more than the links can have'),
+    'denormal quaternion': (wrong('pose.pose.orientation', 0.0, 0.0, 0.0, 1e-200), 'no deflection for'),
+    'wrong frame': (wrong('header.frame_id', 'world'), 'no deflection for'),
+    # Zeros are ROS's word for an unknown one.
+    'zero covariance': (wrong('pose.covariance', np.zeros(36)), 'does not say how certain'),
+    'covariance of metres': (wrong('pose.covariance', np.eye(6).ravel()), 'uncertain by more than'),
     'clock set by an hour': (by_seconds(3600.0), 'ahead of our clock'),
 }
 """What the arm tells of its deflection, and what the compensator says then."""
-
 JOINTS: dict[str, tuple[Notify, str]] = {
     'stale joints': (by_seconds(-1.0), 'no positions of the joints'),
     'leaping joints': (leaps, 'leap by'),
-    'joints at 1e300': (far, 'no positions of the joints'),
+    'joints at 1e300': (wrong('position', [1e300, 1e300]), 'no positions of the joints'),
 }
-"""The same of its joints."""
 
 
 class Plant:
