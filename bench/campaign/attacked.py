@@ -206,14 +206,33 @@ class Attacked(ABC):
         self.owner.close()
 
 
-def _measured(sessions: list[Session], before: int) -> list[str]:
-    """Why sessions have not measured meanwhile."""
-    if not all(session.processing.alive for session in sessions):
-        return ['a pipeline has ended']
-    return [] if sum(s.pipeline.counters.estimates for s in sessions) > before else ['no estimate came']
+class Measuring(Attacked):
+    """A node with sessions: none may end, and estimates must come."""
+
+    @abstractmethod
+    def sessions(self) -> list[Session]:
+        """Those that it has now."""
+
+    def runs(self) -> None:
+        for session in self.sessions():
+            if not session.processing.alive:
+                raise session.failed or RuntimeError('a pipeline has ended')
+
+    def rejected(self) -> int:
+        """By the sessions, or dropped on the way to them."""
+        return sum(s.rejected.total() + s.processing.requests_dropped for s in self.sessions())
+
+    def _estimates(self) -> int:
+        return sum(s.pipeline.counters.estimates for s in self.sessions())
+
+    def faults(self) -> list[str]:
+        return [] if self._estimates() > 100 else ['no estimate came']
+
+    def summary(self) -> str:
+        return f'{self._estimates()} estimates'
 
 
-class Estimator(Attacked):
+class Estimator(Measuring):
     """A simulated rig, with every input there is."""
 
     words = ('--ros-args', '-p', 'filter:=modal', '-p', 'keep_zero:=false')
@@ -225,27 +244,11 @@ class Estimator(Attacked):
         self._node = EstimatorNode(given, null_log, Signals())
         super().__init__(self._node)
 
-    def _sessions(self) -> list[Session]:
+    def sessions(self) -> list[Session]:
         return [self._node.session] if self._node.session is not None else []
 
-    def runs(self) -> None:
-        """Raises what ended the pipeline."""
-        for session in self._sessions():
-            if not session.processing.alive:
-                raise session.failed or RuntimeError('the pipeline has ended')
 
-    def rejected(self) -> int:
-        """By the session, or dropped on the way to it."""
-        return sum(s.rejected.total() + s.processing.requests_dropped for s in self._sessions())
-
-    def faults(self) -> list[str]:
-        return _measured(self._sessions(), 100)
-
-    def summary(self) -> str:
-        return f'{sum(s.pipeline.counters.estimates for s in self._sessions())} estimates'
-
-
-class Chain(Attacked):
+class Chain(Measuring):
     """Two simulated links."""
 
     words = (str(CHAIN),)
@@ -254,25 +257,12 @@ class Chain(Attacked):
         self._node = ChainNode(str(CHAIN), {'bag_dir': str(folder)}, None, null_log, Signals())
         super().__init__(self._node)
 
-    def _sessions(self) -> list[Session]:
+    def sessions(self) -> list[Session]:
         return list(self._node.chain.sessions) if self._node.chain is not None else []
-
-    def runs(self) -> None:
-        """Raises what ended a pipeline."""
-        chain = self._node.chain
-        if chain is not None and not chain.alive:
-            raise chain.failed or RuntimeError('a pipeline has ended')
 
     def rejected(self) -> int:
         """By the sessions and by the chain."""
-        return super().rejected() + sum(s.rejected.total() + s.processing.requests_dropped for s in self._sessions())
-
-    def faults(self) -> list[str]:
-        return _measured(self._sessions(), 100)
-
-    def summary(self) -> str:
-        composed = self._node.chain.composed if self._node.chain is not None else 0
-        return f'{composed} end effectors composed'
+        return super().rejected() + self.owner.gate.rejected.total()
 
 
 class Camera(Attacked):
