@@ -37,7 +37,12 @@ Change = Callable[[Any], object]
 
 def _last(**fields: Any) -> Change:
     """Of the last point."""
-    return lambda message: [setattr(message.points[-1], name, value) for name, value in fields.items()]
+
+    def change(message: Any) -> None:
+        for name, value in fields.items():
+            setattr(message.points[-1], name, value)
+
+    return change
 
 
 REJECTED: dict[str, Change] = {
