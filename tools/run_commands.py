@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -32,76 +33,10 @@ INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
 CUT = 'recordings/cut'  # A recording that a crash left without its end.
 
-CI_RUNS = (
-    (r"^make test( ROOM=measure| PYTEST='--order 3')?$", '.ci/run', 'make test '),
-    (r'^make test-all$', '.ci/run', 'make unit TIER=slow '),
-    (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test-all: lint types contracts unit'),
-    (r'^make docs$', '.ci/run', 'make docs '),
-    (r'^make docs STEP=axe$', '.ci/run', 'make docs STEP=axe '),
-    (r'^make docs STEP=try-page$', '.ci/run', 'make docs STEP=try-page '),
-    (r'^make docs STEP=try-page ARGS=', 'tools/tasks.toml', 'python -m tools.try_page build/site'),
-    (r'^make colcon$', '.ci/run', 'make colcon '),
-    (r'^make release STEP=check$', '.github/workflows/ci.yml', 'make release STEP=check '),
-    (r'^make release STEP=rosdep ', '.github/workflows/ci.yml', 'make release STEP=rosdep '),
-    (r'^make release STEP=deb ', '.github/workflows/ci.yml', 'make release STEP=deb '),
-    (r'^make demo NAME=thesis$', 'test/blind/test_redone.py', "main(['--short', "),
-    (
-        r'^psd-deflection thesis compare-methods --out ',
-        'test/cli/test_thesis.py',
-        "main(['thesis', 'compare-methods', '--out', ",
-    ),
-    (r'^colcon (build|test)\b', 'tools/tasks.toml', '\ncolcon build '),
-    (
-        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|dask|parquet)\]'$",
-        'tools/tasks.toml',
-        "pip install --quiet 'psd_deflection[",
-    ),
-    (r'^make docs STEP=commands\b', '.ci/run', 'make docs STEP=commands '),
-    (r'^make release STEP=wheel$|^pip install dist/\*\.whl', '.ci/run', 'make release STEP=wheel '),
-    (r'^make demo NAME=rerun$', '.ci/run', 'make demo NAME=rerun '),
-    (r'^make shaken$', '.github/workflows/ci.yml', 'make shaken '),
-    (r'^make bits$', '.ci/run', 'make bits '),
-    (r"^pip install '\.\[rerun\]'$", 'tools/tasks.toml', "'.[rerun]'"),
-    (r'^psd-deflection convert .*\.rrd$|^rerun ', 'tools/tasks.toml', 'tools.check_rerun bags/'),
-    (r"^pip install '\.\[ros,monitor,plot\]'$", 'Makefile', "INSTALL,$(VENV)) '.[ros,monitor,plot]'"),
-    (r'^python -m bench\.live$', 'tools/tasks.toml', 'live = '),
-    (r'^python bench/solvers\.py$', 'tools/tasks.toml', 'solvers = '),
-    (r'^python bench/accuracy\.py$', 'tools/tasks.toml', 'accuracy = '),
-    (r'^python -m blind\.run\b', 'tools/tasks.toml', 'python -m blind.run '),
-    (r'^python -m blind\.laws\b', 'tools/tasks.toml', 'python -m blind.laws '),
-    (r'^python -m bench\.campaign\.camera\b', 'tools/tasks.toml', 'python -m bench.campaign.camera'),
-    (r'^python -m bench\.campaign\.hellos$', 'bench/campaign/fuzz.py', "['hellos', "),
-    (r'^python -m bench\.campaign\.messages\b', 'bench/campaign/fuzz.py', "['messages', "),
-    (r'^python -m bench\.campaign\.fuzz\b', 'bench/campaign/fuzz.py', "['fuzz', target, "),
-)
-"""What CI runs without us: pattern, file, and the text in it that does."""
-
-SHORTER = {
-    r'^python -m blind\.coverage$': '--rows 1 --losses 1',
-    r'^python -m blind\.faults$': '--rows 1',
-    r'^python -m blind\.coverage --alarms \d+$': '--alarms 1 --rows 1',
-    r'^python -m blind\.coverage --vibration \d+$': '--vibration 1',
-    r'^python -m blind\.clock$': '--runs 5',
-    r'^python -m blind\.given$': '--hand 2 --only hand-late',
-    r'^python -m blind\.watch\b': '--runs 1 --hours 0',
-    r'^python -m blind\.modes$': '--rigs 3',
-    r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
-    r'^python -m blind\.calibration\b': '--rigs 2',
-    r'^python -m bench\.campaign\.hold\b': '--times 1',
-    r'^python -m bench\.cpu$': '--seconds 2',
-    r'^python -m bench\.rigs$': '--seconds 1 --most 2',
-    r'^python -m bench\.first_look --times \d+$': '--times 1',
-    r'^ros2 topic echo\b': '--once',
-}
-"""Additional arguments with which a command takes only seconds."""
-
-TOOLS = {
-    r'^make demo NAME=firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
-    r'^make docs STEP=shots|first_look': ('chromium', 'chromedriver'),
-    r'^curl ': ('curl',),
-    r'^ros2 ': ('ros2',),
-}
-"""Programs without which a command is skipped with a message."""
+_TABLES = tomllib.loads((ROOT / 'tools' / 'run_commands.toml').read_text(encoding='utf-8'))
+CI_RUNS: list[list[str]] = _TABLES['ci']
+SHORTER: dict[str, str] = _TABLES['shorter']
+TOOLS: dict[str, list[str]] = _TABLES['tools']
 
 ADMINISTRATION = re.compile(
     r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|source|ssh|sudo|systemctl|udevadm|useradd) '
