@@ -49,15 +49,9 @@ from psd_deflection.studies.discover.from_recordings import read_observation
 READ_FRAMES = 18  # Frames of one read: the reader waits until a block is nearly whole.
 
 TEN = (
-    'clamp_bending_compliance,compliance=1e-4',
-    'damping,bending_ratio=0.02',
-    'creep,amplitude=0.03',
-    'load_direction,angle=0.01',
-    'sensor_position,psd=1,x=1e-3',
-    'sensor_rotation,psd=2,angle=0.01',
-    'axis_crosstalk,psd=1,xy=0.02',
-    'sensor_gain,psd=2,x=0.01',
-    'thermal_drift,psd=1,x=1e-6',
+    *('clamp_bending_compliance,compliance=1e-4', 'damping,bending_ratio=0.02', 'creep,amplitude=0.03'),
+    *('load_direction,angle=0.01', 'sensor_position,psd=1,x=1e-3', 'sensor_rotation,psd=2,angle=0.01'),
+    *('axis_crosstalk,psd=1,xy=0.02', 'sensor_gain,psd=2,x=0.01', 'thermal_drift,psd=1,x=1e-6'),
     'mains_interference,frequency=50,amplitude_x1=0.001',
 )
 

@@ -32,14 +32,8 @@ AFTER, AFTER_SECONDS = 8, 1.5
 SIZE = 20
 BORDER = 0.04  # How far from the limit a share must be for the two Fisher informations to agree on its side.
 GROUPS = (
-    'psd_1.rotation',
-    'psd_2.rotation',
-    'psd_1.gain',
-    'psd_2.gain',
-    'psd_1.center',
-    'psd_2.center',
-    'psd_1.nonlinearity',
-    'psd_2.nonlinearity',
+    *('psd_1.rotation', 'psd_2.rotation', 'psd_1.gain', 'psd_2.gain', 'psd_1.center', 'psd_2.center'),
+    *('psd_1.nonlinearity', 'psd_2.nonlinearity'),
 )
 """Groups that are moved: a camera shows three tolerances of them."""
 Z95 = 1.959964

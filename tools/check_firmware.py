@@ -9,20 +9,7 @@ import time
 from pathlib import Path
 
 from psd_deflection.base.log import texts
-from psd_deflection.devices.protocol.frames import (
-    BadFrame,
-    Frame,
-    FrameDecoder,
-    HelloFrame,
-    HelloRequestFrame,
-    PingFrame,
-    PongFrame,
-    SampleFrame,
-    StartFrame,
-    StatusFrame,
-    StopFrame,
-    encode,
-)
+from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.records import Record, SampleBlock
 from psd_deflection.rig.config import load_rig
@@ -30,15 +17,7 @@ from psd_deflection.run.session import Session
 from tools.program import Program
 
 COMMAND = [
-    'qemu-system-arm',
-    '-machine',
-    'mps2-an385',
-    '-display',
-    'none',
-    '-monitor',
-    'none',
-    '-chardev',
-    'pty,id=uart',
+    *('qemu-system-arm', '-machine', 'mps2-an385', '-display', 'none', '-monitor', 'none', '-chardev', 'pty,id=uart'),
 ]
 PATIENCE_S = 60.0
 
@@ -52,15 +31,15 @@ def expected(number: int) -> tuple[int, ...]:
 def dialogue(port: str) -> tuple[int, float]:
     """Request every answer in docs/protocol.md; return the bad frames and the median round trip of a PING, s."""
     line = SerialPort(port, 921_600)
-    decoder = FrameDecoder()
+    decoder = protocol.FrameDecoder()
     bad = 0
 
-    def until(kind: type[Frame], kept: list[Frame] | None = None) -> Frame:
+    def until(kind: type[protocol.Frame], kept: list[protocol.Frame] | None = None) -> protocol.Frame:
         nonlocal bad
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             frames = decoder.feed(line.read(0.1))
-            bad += sum(isinstance(f, BadFrame) for f in frames)
+            bad += sum(isinstance(f, protocol.BadFrame) for f in frames)
             if kept is not None:
                 kept += frames
             for frame in frames:
@@ -68,31 +47,31 @@ def dialogue(port: str) -> tuple[int, float]:
                     return frame
         raise SystemExit(f'FAILED: no {kind.__name__} in {PATIENCE_S:g} s')
 
-    line.write(b'\x00' + encode(HelloRequestFrame()))
-    hello = until(HelloFrame)
-    if not isinstance(hello, HelloFrame) or hello.version != 1:
+    line.write(b'\x00' + protocol.encode(protocol.HelloRequestFrame()))
+    hello = until(protocol.HelloFrame)
+    if not isinstance(hello, protocol.HelloFrame) or hello.version != 1:
         raise SystemExit(f'FAILED: HELLO is {hello!r}')
-    until(StatusFrame)
+    until(protocol.StatusFrame)
     trips = []
     for cookie in range(100):
         asked = time.monotonic()
-        line.write(encode(PingFrame(cookie)))
-        pong = until(PongFrame)
+        line.write(protocol.encode(protocol.PingFrame(cookie)))
+        pong = until(protocol.PongFrame)
         trips.append(time.monotonic() - asked)
-        if not isinstance(pong, PongFrame) or pong.cookie != cookie:
+        if not isinstance(pong, protocol.PongFrame) or pong.cookie != cookie:
             raise SystemExit(f'FAILED: {pong!r} answers PING {cookie}')
-    line.write(encode(StopFrame()) + encode(PingFrame(0)))
-    until(PongFrame)
+    line.write(protocol.encode(protocol.StopFrame()) + protocol.encode(protocol.PingFrame(0)))
+    until(protocol.PongFrame)
     # Samples that were under way have arrived; from here on only HELLO and STATUS may come.
-    quiet: list[Frame] = []
-    line.write(encode(PingFrame(1)))
-    until(PongFrame, quiet)
+    quiet: list[protocol.Frame] = []
+    line.write(protocol.encode(protocol.PingFrame(1)))
+    until(protocol.PongFrame, quiet)
     quiet = []
-    until(StatusFrame, quiet)
-    if any(isinstance(f, SampleFrame) for f in quiet):
+    until(protocol.StatusFrame, quiet)
+    if any(isinstance(f, protocol.SampleFrame) for f in quiet):
         raise SystemExit('FAILED: samples after STOP')
-    line.write(encode(StartFrame()))
-    until(SampleFrame)
+    line.write(protocol.encode(protocol.StartFrame()))
+    until(protocol.SampleFrame)
     line.close()
     return bad, sorted(trips)[len(trips) // 2]
 

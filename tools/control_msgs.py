@@ -52,24 +52,13 @@ trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_error
 """,
 }
 USED = (
-    'action_msgs',
-    'builtin_interfaces',
-    'geometry_msgs',
-    'service_msgs',
-    'std_msgs',
-    'trajectory_msgs',
-    'type_description_interfaces',
-    'unique_identifier_msgs',
+    *('action_msgs', 'builtin_interfaces', 'geometry_msgs', 'service_msgs', 'std_msgs', 'trajectory_msgs'),
+    *('type_description_interfaces', 'unique_identifier_msgs'),
 )
 """The packages whose messages are in it."""
 RUNTIME = (
-    'rosidl_runtime_c',
-    'rosidl_typesupport_c',
-    'rosidl_typesupport_fastrtps_c',
-    'rosidl_typesupport_fastrtps_cpp',
-    'rosidl_typesupport_introspection_c',
-    'fastcdr',
-    'rmw',
+    *('rosidl_runtime_c', 'rosidl_typesupport_c', 'rosidl_typesupport_fastrtps_c', 'rosidl_typesupport_fastrtps_cpp'),
+    *('rosidl_typesupport_introspection_c', 'fastcdr', 'rmw'),
 )
 SUPPORTS = ('rosidl_typesupport_fastrtps_c', 'rosidl_typesupport_introspection_c')
 """What the only rmw that has a wheel asks for."""

@@ -85,24 +85,9 @@ def moved(rng: np.random.Generator) -> render.Pose:
 
 
 HURTS = (
-    'none',
-    'motion blur',
-    'long exposure',
-    'occluder',
-    'occluder of its colour',
-    'missing disc',
-    'second target',
-    'ghost',
-    'over-exposed',
-    'blooming',
-    'out of focus',
-    'dark',
-    'far away',
-    'outside',
-    'glare',
-    'clutter',
-    'nothing',
-    'lines of noise',
+    *('none', 'motion blur', 'long exposure', 'occluder', 'occluder of its colour', 'missing disc', 'second target'),
+    *('ghost', 'over-exposed', 'blooming', 'out of focus', 'dark', 'far away', 'outside', 'glare', 'clutter'),
+    *('nothing', 'lines of noise'),
 )
 
 

@@ -17,17 +17,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.devices.protocol.frames import (
-    FrameDecoder,
-    HelloFrame,
-    HelloRequestFrame,
-    PingFrame,
-    PongFrame,
-    SampleFrame,
-    StartFrame,
-    StatusFrame,
-    encode,
-)
+from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.records import CHANNELS
 
@@ -44,7 +34,7 @@ Tamper = Callable[[int, bytes], bytes | None]
 """What becomes of a sample's frame on the line; None where it arrives as it is."""
 
 
-def hello_of(serial: str = SERIAL, rate: float = 1000.0) -> HelloFrame:
+def hello_of(serial: str = SERIAL, rate: float = 1000.0) -> protocol.HelloFrame:
     """What the device says of itself."""
     info: dict[str, object] = {
         'serial': serial,
@@ -53,7 +43,7 @@ def hello_of(serial: str = SERIAL, rate: float = 1000.0) -> HelloFrame:
         'channels': list(CHANNELS),
         'volts_per_count': VOLTS_PER_COUNT,
     }
-    return HelloFrame(1, info)
+    return protocol.HelloFrame(1, info)
 
 
 def identities(volts: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
@@ -88,7 +78,7 @@ class Line:
         self._second = 0
         self._stop = threading.Event()
         self._terminal: PseudoTerminal | None = None
-        self._decoder = FrameDecoder()
+        self._decoder = protocol.FrameDecoder()
         self._start = time.monotonic()
         self.plug(name)
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -102,7 +92,7 @@ class Line:
             self.greeted.clear()
             self._listening = False
             self._pending.clear()
-            self._decoder = FrameDecoder()
+            self._decoder = protocol.FrameDecoder()
             self.name = name
             self._terminal = PseudoTerminal(self.folder / name)
 
@@ -209,13 +199,13 @@ class Line:
 
     def _receive(self, received: bytes) -> None:
         for frame in self._decoder.feed(b'\x00' + received if not self._listening else received):
-            if isinstance(frame, HelloRequestFrame):
-                self._pending += encode(hello_of(self.serial))
+            if isinstance(frame, protocol.HelloRequestFrame):
+                self._pending += protocol.encode(hello_of(self.serial))
                 self._listening = True
                 self.greeted.set()
-            elif isinstance(frame, PingFrame):
-                self._pending += encode(PongFrame(frame.cookie, self._clock_us))
-            elif isinstance(frame, StartFrame) and self.obedient:
+            elif isinstance(frame, protocol.PingFrame):
+                self._pending += protocol.encode(protocol.PongFrame(frame.cookie, self._clock_us))
+            elif isinstance(frame, protocol.StartFrame) and self.obedient:
                 self.mute = self.obedient = False
 
     def _sample(self) -> None:
@@ -235,7 +225,7 @@ class Line:
         if self.freeze:
             counts[3:] = [high - DIGIT // 2, 0, 16384]
         flags, self.flags = self.flags, 0
-        frame = encode(SampleFrame(flags, seq % 2**32, max(t_us, 0), tuple(counts)))
+        frame = protocol.encode(protocol.SampleFrame(flags, seq % 2**32, max(t_us, 0), tuple(counts)))
         changed = self.tamper(identity, frame) if self.tamper is not None else None
         if changed is not None:
             self.taken_by_fault.add(identity)
@@ -243,4 +233,4 @@ class Line:
         self._pending += frame
         if self.sent // RATE != self._second:
             self._second = self.sent // RATE
-            self._pending += encode(hello_of(self.serial)) + encode(StatusFrame(0, 2150))
+            self._pending += protocol.encode(hello_of(self.serial)) + protocol.encode(protocol.StatusFrame(0, 2150))

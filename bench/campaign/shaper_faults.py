@@ -204,13 +204,8 @@ def shaper_faults(times: int) -> float:
 
 
 OF_ACTION = (
-    'strange goals',
-    'goal replaced',
-    'goal replaced, shaper starved',
-    'goal cancelled',
-    'controller rejects',
-    'controller dies',
-    'controller says nothing more',
+    *('strange goals', 'goal replaced', 'goal replaced, shaper starved', 'goal cancelled', 'controller rejects'),
+    *('controller dies', 'controller says nothing more'),
 )
 MOST_S = 30.0  # Longest time until a goal ends that nobody follows any more, s.
 

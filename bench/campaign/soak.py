@@ -18,16 +18,7 @@ import numpy as np
 from bench.campaign.line import hello_of
 from blind.campaign import options
 from psd_deflection.base.log import texts
-from psd_deflection.devices.protocol.frames import (
-    FrameDecoder,
-    FrameType,
-    HelloRequestFrame,
-    PingFrame,
-    PongFrame,
-    SampleFrame,
-    StatusFrame,
-    encode,
-)
+from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
@@ -68,7 +59,7 @@ class PolledDevice:
         return self.start_ns + round(number * MS / (1.0 + SKEW))
 
     def _run(self) -> None:
-        decoder, pending, chance = FrameDecoder(), b'', random.Random(2)
+        decoder, pending, chance = protocol.FrameDecoder(), b'', random.Random(2)
         decoder.feed(b'\x00')
         while not self._stop.is_set():
             now = time.monotonic_ns()
@@ -76,21 +67,21 @@ class PolledDevice:
             now = time.monotonic_ns()
             try:
                 for frame in decoder.feed(os.read(self.port.master, 4096)):
-                    if isinstance(frame, HelloRequestFrame):
-                        pending += encode(hello_of('SOAK'))
+                    if isinstance(frame, protocol.HelloRequestFrame):
+                        pending += protocol.encode(hello_of('SOAK'))
                         self.listening_from = self.taken
-                    elif isinstance(frame, PingFrame):
+                    elif isinstance(frame, protocol.PingFrame):
                         device_us = int((now - self.start_ns) * (1.0 + SKEW) / 1000)
-                        pending += encode(PongFrame(frame.cookie, device_us))
+                        pending += protocol.encode(protocol.PongFrame(frame.cookie, device_us))
             except (BlockingIOError, OSError):
                 pass
             while self.true_ns(self.taken) < now - now % MS:
                 shake = chance.randrange(-6, 7)
                 counts = (shake, -shake, 16384, shake, shake, 16384 - shake)
-                pending += encode(SampleFrame(0, self.taken % 2**32, self.taken * 1000, counts))
+                pending += protocol.encode(protocol.SampleFrame(0, self.taken % 2**32, self.taken * 1000, counts))
                 self.taken += 1
                 if self.taken % 1000 == 0:
-                    pending += encode(hello_of('SOAK')) + encode(StatusFrame(0, 2150))
+                    pending += protocol.encode(hello_of('SOAK')) + protocol.encode(protocol.StatusFrame(0, 2150))
             if self.listening_from < 0:
                 pending = b''
                 continue
@@ -145,7 +136,7 @@ CRC_TABLE = np.array([zlib.crc32(bytes((255 ^ n,))) ^ zlib.crc32(b'\xff') for n 
 def sample_frames(seq: IntArray, t_us: IntArray, counts: IntArray) -> bytes:
     """``encode(SampleFrame(0, ...))`` of many samples at once, one behind the other, 32 bytes each."""
     frames = np.zeros(len(seq), FRAME)
-    frames['type'], frames['seq'], frames['t'], frames['counts'] = FrameType.SAMPLE, seq % 2**32, t_us, counts
+    frames['type'], frames['seq'], frames['t'], frames['counts'] = protocol.FrameType.SAMPLE, seq % 2**32, t_us, counts
     payload = frames.view(np.uint8).reshape(len(seq), FRAME.itemsize)
     size = FRAME.itemsize
     crc = np.full(len(seq), 0xFFFFFFFF, np.uint32)
@@ -224,10 +215,10 @@ def simulated_time(hours: float) -> bool:
     rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
     acquisition = Acquisition(rig, texts(lambda text: print(f'  said: {text}')))
     pipeline = Pipeline(rig)
-    decoder = FrameDecoder()
+    decoder = protocol.FrameDecoder()
     decoder.feed(b'\x00')
     rng = np.random.default_rng(4)
-    once_a_second = encode(hello_of('SOAK')) + encode(StatusFrame(0, 2150))
+    once_a_second = protocol.encode(hello_of('SOAK')) + protocol.encode(protocol.StatusFrame(0, 2150))
     samples = int(hours * 3600) * 1000
     # The numbers wrap half way; blocks are cut at multiples of 20, and 2^32 is none.
     first = (2**32 - samples // 2) // 20 * 20
