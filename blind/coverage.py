@@ -335,6 +335,55 @@ def over_the_bound(
     return {name: np.sqrt(np.square(found).mean(axis=0)) / bound(row) for name, found in poses.items()}
 
 
+def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int = 1) -> tuple[float, str]:
+    """Largest error in own standard deviations of any estimate of a rig with one wrong reading, and what is named.
+    ``kind``: dead, stuck, inverted (``channel`` 0 to 3: x1, y1, x2, y2) or swapped (0 or 1: the PSD whose x and y are
+    exchanged). Four seconds at rest, then ``load`` (N, N, N m) switched on for four."""
+    n = 8000
+    loads = np.zeros((n, 3))
+    loads[n // 2 + 7 :] = load
+    fine = generator.motion(loads, 0.585, [])
+    clean, truth = optics_of(fine), middles(fine)
+    volts = volts_of(Row(kind), clean, seed)
+    column = (0, 1, 3, 4)[channel]
+    if kind == 'dead':
+        volts[:, column] = 0.0
+    elif kind == 'stuck':
+        volts[n // 4 :, column] = volts[n // 4, column]
+    elif kind == 'inverted':
+        volts[:, column] *= -1.0
+    else:
+        pair = [3 * channel, 3 * channel + 1]
+        volts[:, pair] = volts[:, pair[::-1]]
+    # Zeroed as it is: the readings at rest are what they are then.
+    pipeline = Pipeline(rig(Row(kind)))
+    worst = 0.0
+    for e in estimates(pipeline, volts, np.ones(n, bool), zero_at=SETTLED // 2):
+        if e.block < SETTLED // 2:
+            continue
+        sd = np.sqrt(np.array(e.covariance).reshape(3, 3).diagonal())
+        worst = max(worst, float(np.abs((np.array((e.dx, e.dy, e.theta)) - truth[e.block]) / sd).max()))
+    return worst, pipeline.estimator.most_likely_wrong()
+
+
+WRONG = tuple(
+    [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
+    + [('swapped', psd) for psd in range(2)]
+)
+
+
+def one_wrong(rows: int | None) -> int:
+    """Print :func:`fault` for every wrong reading, or the first so many, at 10, 30 and 50 N."""
+    print('| wrong | load | largest error, own sd | named |\n|---|---|---|---|')
+    for kind, channel in WRONG[:rows]:
+        for force in (10.0, 30.0, 50.0):
+            for name, load in (('sidebar', (0.0, -force, -0.585 * force)), ('link', (0.0, -force, 0.0))):
+                worst, named = fault(kind, channel, load)
+                words = f'{kind} {channel} | {force:g} N, {name} | {worst:.1f} | {named or "cannot be determined"}'
+                print(f'| {words} |', flush=True)
+    return 0
+
+
 VIBRATION_SEEDS = 8
 
 SHAKEN_HEAD = '| Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
@@ -383,7 +432,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar='SEEDS',
         help='instead: a link that vibrates steadily, each tone by so many seeds',
     )
+    parser.add_argument('--faults', action='store_true', help='instead: one wrong reading after the other')
     args = parser.parse_args(argv)
+    if args.faults:
+        return one_wrong(args.rows)
     if args.vibration:
         return vibrations(args.vibration)
     if args.alarms:

@@ -7,14 +7,11 @@ import ast
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import grimp
-import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 PACKAGES = ('psd_deflection', 'msg_adapters')
 MOST_COMPLEX, MOST_PARAMETERS = 20, 8
@@ -26,20 +23,6 @@ def room_of(module: str) -> str:
     """The room of a module, without the package's name; '' for the package's own file."""
     parts = module.split('.')
     return parts[0] if parts[0] != PACKAGES[0] else '.'.join(parts[1:2])
-
-
-def circles(arrows: Iterable[tuple[str, str]]) -> list[list[str]]:
-    """Groups of names that lead to each other, sorted."""
-    pairs = list(arrows)
-    names = sorted({name for pair in pairs for name in pair})
-    place = {name: i for i, name in enumerate(names)}
-    rows, columns = [place[a] for a, _ in pairs], [place[b] for _, b in pairs]
-    matrix = csr_array((np.ones(len(pairs)), (rows, columns)), shape=(len(names), len(names)))
-    _, groups = connected_components(matrix, connection='strong')
-    found: dict[int, list[str]] = defaultdict(list)
-    for name, group in zip(names, groups.tolist(), strict=True):
-        found[group].append(name)
-    return sorted(group for group in found.values() if len(group) > 1)
 
 
 class Measured(NamedTuple):
@@ -139,13 +122,10 @@ def main() -> int:
     sys.path.insert(0, str(root))
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
     between: dict[tuple[str, str], int] = defaultdict(int)
-    modules = []
     for module in graph.modules:
         for other in graph.find_modules_directly_imported_by(module):
-            if '' not in (room_of(module), room_of(other)):
-                modules.append((module, other))
-                if room_of(module) != room_of(other):
-                    between[room_of(module), room_of(other)] += 1
+            if '' not in (room_of(module), room_of(other)) and room_of(module) != room_of(other):
+                between[room_of(module), room_of(other)] += 1
     files: dict[str, list[int]] = defaultdict(list)
     for package in PACKAGES:
         for path in (root / package).rglob('*.py'):
@@ -164,8 +144,6 @@ def main() -> int:
         print(f'  {name}: complexity {one.complexity}, {one.parameters} parameters')
     print('', *beside(root), sep='\n')
     print(f'\n{len(files)} rooms, {len(every)} files, {sum(every)} lines, {len(between)} arrows')
-    of_rooms, of_modules = circles(between) or 'none', circles(modules) or 'none'
-    print(f'circles of rooms: {of_rooms}; circles of modules: {of_modules}')
     return 0
 
 

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from blind.coverage import ROWS, UNEQUAL, Inside, on_a_moving_base, over_the_bound, score, warming
-from blind.faults import fault
+from blind.coverage import ROWS, UNEQUAL, Inside, fault, on_a_moving_base, over_the_bound, score, warming
 
 pytestmark = pytest.mark.slow
 
