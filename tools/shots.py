@@ -81,20 +81,9 @@ def away_without(device: Program) -> Callable[[Any], bool]:
     return ready
 
 
-TWO_FRAMES = (
-    'const done = arguments[0]; requestAnimationFrame(() => setTimeout(() => requestAnimationFrame(done), 300))'
-)
-
-
 def drawn(seconds: float) -> Callable[[Any], bool]:
     """Whether so many seconds of data were drawn."""
     return lambda driver: int(driver.execute_script('return document.body.dataset.rows ?? 0')) >= BLOCKS_PER_S * seconds
-
-
-def charted(driver: Any) -> bool:
-    """Whether the charts that a report shows are drawn; those in closed details are not."""
-    plots = '[...document.querySelectorAll(".plot")].filter((p) => p.clientWidth > 0)'
-    return bool(driver.execute_script(f'return {plots}.every((p) => p.querySelector(".uplot"))'))
 
 
 def main() -> int:
