@@ -19,7 +19,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import Section
 from tools import gallery
-from tools.gallery_cases import CASES, STUDIES, Case
+from tools.gallery import CASES, STUDIES, Case
 from tools.program import ROOT
 from tools.run_commands import FENCE, PAGES
 

@@ -29,9 +29,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import SetBool
 
-from bench.campaign.plant import BREAKS, URDF
 from bench.campaign.hold import WITHIN
-from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful
+from bench.campaign.plant import BREAKS, DEFLECTIONS, JOINTS, URDF, Plant, faithful
 from test.ros.conftest import WARNINGS
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
