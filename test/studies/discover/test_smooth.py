@@ -326,9 +326,9 @@ def test_averages_are_those_over_all_subsets(slabs: FloatArray, near: float, mon
 
 @pytest.mark.parametrize(('size', 'remains'), [(0.5, True), (0.0, False)])
 def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool) -> None:
-    """Small terms beside a named effect of which one number, 900 times the noise, is no amplitude."""
-    names = ('a', 'x'), ('a', 'shape'), ('b', 'x'), ('b', 'y'), ('c', 'x')
-    truth = (SIGMA, 0.9, size * SIGMA, -0.8 * size * SIGMA, 0.6 * size * SIGMA)
+    """Small terms beside a named effect ten times the noise, of which one number is no amplitude."""
+    names = ('a', 'x'), ('a', 'shape'), ('b', 'x'), ('b', 'y'), ('c', 'x'), ('d', 'x')
+    truth = (10.0 * SIGMA, 0.9, size * SIGMA, -0.8 * size * SIGMA, 0.6 * size * SIGMA, 0.06 * SIGMA)
     shown = pictures(*names)
     plant = LinearPlant(shown, sum((v * shown[n] for n, v in zip(names, truth, strict=True)), noise()))
     a = active('a', x=0.5, shape=0.1)
@@ -338,6 +338,7 @@ def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool) -
     found = [
         (candidate('b', 'x', 'y'), [[1e-3 * shown['b', 'x']], [1e-3 * shown['b', 'y']]]),
         (candidate('c', 'x'), [[1e-3 * shown['c', 'x']]]),
+        (candidate('d', 'x'), [[1e-3 * shown['d', 'x']]]),
     ]
     got = predictive.predictive_of(plant, fit, Screen(plant, found), np.random.default_rng(0))
     assert got is not None
@@ -355,10 +356,14 @@ def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool) -
     assert got.unexplained is remains
     assert (got.tree() is None) is not remains
     if remains:
-        assert got.unseen == pytest.approx(unseen(table), rel=2e-3)
-        assert [t.name for t in got.terms] == ['b x', 'b y', 'c']
+        assert got.unseen == pytest.approx(unseen(table[:, :5]), rel=0.08)
+        *clear, weak = got.terms
+        assert [t.name for t in got.terms] == ['b x', 'b y', 'c', 'd']
         want = np.linalg.lstsq(table, y, rcond=None)[0]
-        assert [t.value for t in got.terms] == pytest.approx(want[2:].tolist(), rel=0.02)
-        assert [t.weight for t in got.terms] == pytest.approx([1.0] * 3, abs=1e-3)
+        assert [t.value for t in clear] == pytest.approx(want[2:5].tolist(), rel=0.05)
+        assert [t.weight for t in clear] == pytest.approx([1.0] * 3, abs=0.05)
+        # What may be there by chance takes part by how likely it is.
+        assert weak.value / want[5] == pytest.approx(weak.weight, abs=0.1)
+        assert 0.01 < weak.weight < 0.9
         values = [v for a in got.effects for v in a.values.values()]
-        assert values == pytest.approx(want.tolist(), rel=0.02)
+        assert values[:5] == pytest.approx(want[:5].tolist(), rel=0.05)
