@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import Image
 
 from blind.render import Pose, Scene, photograph
 from tools.program import PSD_DEFLECTION, Program
@@ -63,52 +61,5 @@ def test_images_become_references_and_a_rejected_one_its_reason(domain: int, pee
             return any('no target' in s.message for r in reports for s in r.status)
 
         peer.until(reported(dark, rejected), 'the reason')
-    finally:
-        node.end(signal.SIGINT)
-
-
-@pytest.mark.slow
-def test_a_parameter_that_is_set_acts_with_lens_found(domain: int, peer: Any, tmp_path: Path) -> None:
-    scene, rng = Scene(), np.random.default_rng(0)
-    words = ('-r', 'image:=/cam/image_raw', '-p', 'rest.frames:=1')
-    node = Program([*PSD_DEFLECTION, 'camera', '--ros-args', *words])
-    try:
-        images = peer.node.create_publisher(Image, '/cam/image_raw', 10)
-        lenses = peer.node.create_publisher(CameraInfo, '/cam/camera_info', 10)
-        poses = peer.collect(PoseStamped, '/reference/deflection')
-        peer.until(lambda: peer.node.count_subscribers('/cam/image_raw/compressed') > 0, 'compressed images')
-        peer.until(lambda: lenses.get_subscription_count() > 0, 'the lens')
-        still, moved = (photograph(scene, [pose], rng) for pose in (Pose(), Pose(1e-3, -2e-3, 0.05)))
-        seconds = 0
-
-        def answered(image: Any) -> Any:
-            """Where the plate is found in the image."""
-            nonlocal seconds
-            first = seconds = seconds + 1
-
-            def asked() -> bool:
-                nonlocal seconds
-                seconds += 1
-                lenses.publish(CameraInfo(k=[float(v) for v in scene.matrix]))
-                images.publish(message(image, seconds))
-                return bool(poses) and poses[-1].header.stamp.sec > first
-
-            peer.until(asked, 'an answer')
-            return poses[-1].pose.position
-
-        assert answered(still).x == pytest.approx(0.0, abs=10e-6)
-        assert answered(moved).x == pytest.approx(1e-3, abs=10e-6)
-        # The first image may have come before the lens: this begins anew, and has it.
-        for name, value in (('target.spacing', 0.05), ('target.radius', 0.016)):
-            set_to = Parameter(name, value=value).to_parameter_msg()
-            request = SetParameters.Request(parameters=[set_to])
-            (result,) = peer.call(SetParameters, '/camera/set_parameters', request).results
-            assert result.successful, result.reason
-        node.until('a parameter was changed: the next good frames are the rest')
-        assert answered(still).x == pytest.approx(0.0, abs=20e-6)
-        at = answered(moved)
-        assert [at.x, at.y] == pytest.approx([2e-3, -4e-3], abs=20e-6)
-        since = '\n'.join(node.lines).rpartition('a parameter was changed')[2]
-        assert 'is not corrected' not in since
     finally:
         node.end(signal.SIGINT)

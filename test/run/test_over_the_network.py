@@ -14,20 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import texts
-from psd_deflection.cli.main import main
 from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, HelloRequestFrame, PingFrame, encode
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.serve import serve
 from psd_deflection.devices.served_sockets import open_sockets
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival
-from psd_deflection.run.session import Session
 from test.heard import WAIT_S
-from test.run.conftest import HELLO, Estimates, ScriptedDevice
+from test.run.conftest import HELLO, ScriptedDevice
 from test.run.test_acquisition import (  # noqa: F401 - they run here once more, on this module's device
     HELLO_INFO,
     Run,
@@ -111,16 +105,6 @@ def run(device: ScriptedHost, rig: Rig) -> Iterator[Run]:
     started = Run(rig)
     yield started
     started.acquisition.stop()
-
-
-def test_unknown_protocol_suggests_remote_line_speed(
-    device: ScriptedHost,
-    rig: Rig,
-    short_wait: Any,  # noqa: F811
-) -> None:
-    device.answer = b'$GPGGA,123519,4807.038,N\r\n'
-    with pytest.raises(DeviceError, match=r'26 bytes but no frame .* is the line speed at the other end right'):
-        Acquisition(rig, texts(print)).open()
 
 
 def test_the_diagnostics_name_the_port_and_no_line_speed(run: Run, device: ScriptedHost) -> None:
@@ -294,27 +278,3 @@ def served(request: pytest.FixtureRequest) -> Iterator[str]:
         yield port.name
         stop.set()
         thread.join()
-
-
-def test_network_run_is_recorded_and_replays_exactly(
-    served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    logged: list[str] = []
-    rig = load_rig(overrides={'port': served, 'record': True, 'bag_dir': str(tmp_path), 'keep_zero': False})
-    session = Session(rig, texts(logged.append))
-    estimates = Estimates(40)
-    session.processing.sinks.append(estimates)
-    try:
-        session.start()
-        assert estimates.enough.wait(WAIT_S), logged
-    finally:
-        folder = session.close()
-    assert session.failed is None
-    assert session.acquisition.counters.bad == 0
-    assert main(['replay', str(folder), '--compare', '--strict']) == 0
-    assert 'no bit differs' in capsys.readouterr().out
-    again = Acquisition(load_rig(overrides={'port': served}), texts(logged.append))
-    again.open()
-    again.start()
-    assert isinstance(again.queue.get(timeout=WAIT_S), Arrival)
-    again.stop()
