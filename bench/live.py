@@ -201,7 +201,7 @@ def parts(seconds: float, times: int) -> list[float]:
 class Device:
     """Writes samples to a port by the clock; ``written``: when it began to write the last byte of each block, ns."""
 
-    def __init__(self, block: int = 20) -> None:
+    def __init__(self) -> None:
         from psd_deflection.devices.contract_frames import SimulatedFrames
         from psd_deflection.devices.pseudo_terminal import PseudoTerminal
         from psd_deflection.devices.rig_feed import RigFeed
@@ -209,7 +209,6 @@ class Device:
 
         self.port = PseudoTerminal()
         self.device = SimulatedFrames(RigFeed(load_rig(), lambda _, n: np.zeros((n, 3))))
-        self._block = block
         self.written: list[int] = []
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -229,7 +228,7 @@ class Device:
                 os.write(self.port.master, self.device.receive(asked, 0) + stream)
             except OSError:
                 continue
-            ended = self.device.taken // self._block - before // self._block
+            ended = self.device.taken // 20 - before // 20
             self.written += [now] * ended
 
 
@@ -394,27 +393,12 @@ def live_rows(alone: Latencies, with_page: Latencies, bare_parts: list[float]) -
                 [float(np.percentile(part, percent)) for part in np.array_split(values, parts)]
                 for values in (found.ours, found.bare)
             )
-            rows.append(
-                Row(
-                    f'live{what}: last byte of a block to callback in another process, {word}',
-                    'ms',
-                    [
-                        figure('psd_deflection', 'ours', ours),
-                        figure('bare rclpy publish to callback', 'limit', bare, bound),
-                    ],
-                )
-            )
-        shares = [100 * share for share in found.shares]
-        rows.append(
-            Row(
-                f'live{what}: CPU of the node, recording',
-                '% of a core',
-                [
-                    figure('node', 'ours', shares),
-                    figure('reading the port, publishing, writing, each bare and alone', 'limit', bare_parts, most),
-                ],
-            )
-        )
+            work = f'live{what}: last byte of a block to callback in another process, {word}'
+            limit = figure('bare rclpy publish to callback', 'limit', bare, bound)
+            rows.append(Row(work, 'ms', [figure('psd_deflection', 'ours', ours), limit]))
+        shares = figure('node', 'ours', [100 * share for share in found.shares])
+        limit = figure('reading the port, publishing, writing, each bare and alone', 'limit', bare_parts, most)
+        rows.append(Row(f'live{what}: CPU of the node, recording', '% of a core', [shares, limit]))
     return rows
 
 

@@ -4,7 +4,6 @@
 
 import json
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -187,7 +186,6 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
     sheet.rate('parameter inside its 95 % interval', [], [inside for _, inside in cover], low, high, False)
     _cost(sheet, rows)
     sheet.lines += ['', 'detection (truth in the answer or its sets) by gap:', *_curve(rows)]
-    sheet.lines += ['', 'confusion (truth: first named), gap >= 3 floors:', *_confusion(single)]
     sheet.lines += ['', f'failures ({len(sheet.failures)}):', *('  ' + f for f in dict.fromkeys(sheet.failures))]
     outside = [key for key, inside in cover if not inside]
     sheet.lines += ['', f'parameters outside their interval ({len(outside)}):', *('  ' + k for k in outside)]
@@ -306,17 +304,6 @@ def _score_by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
     sheet.rate('hand: an effect named that is none', of, false, 0.0, 0.0, False)
     sheet.rate('hand: something unknown, nothing is', of, unknown, 0.0, 0.0, False)
     sheet.rate('hand: a law told', of, [any(u['law'] for u in r.answer['unknown']) for r in of], 0.0, 0.0, False)
-    sheet.lines.append('        kind       cases  named  lines right  effects  false  unknown')
-    for kind in dict.fromkeys(r.key.split('-')[1] for r in of):
-        at = [i for i, r in enumerate(of) if r.key.split('-')[1] == kind]
-        wrong = [i for i in at if of[i].wrong]
-        lines = [b for i in wrong for _, b in reported[i]]
-        hid = [i for i in at if of[i].truth]
-        sheet.lines.append(
-            f'        {kind:10s} {len(at):5d}  {sum(any(a for a, _ in reported[i]) for i in wrong)}/{len(wrong)}'
-            f'    {sum(lines)}/{len(lines)}   {sum(found[i] for i in hid)}/{len(hid)}'
-            f'   {sum(false[i] for i in at)}  {sum(unknown[i] for i in at)}'
-        )
 
 
 def _held_out(sheet: _Sheet, rows: Sequence[Row]) -> None:
@@ -355,14 +342,6 @@ def _curve(rows: Sequence[Row]) -> list[str]:
         share = f'{100 * k / len(of):5.1f} % ({k}/{len(of)}; 95 %: {100 * low:.1f} to {100 * high:.1f})'
         lines.append(f'  {gap:5.1f} floors: {share}')
     return lines
-
-
-def _confusion(rows: Sequence[Row]) -> list[str]:
-    table: dict[str, Counter[str]] = {}
-    for r in rows:
-        message = r.named[0] if r.named else r.answer['verdict']
-        table.setdefault(r.truth[0]['name'], Counter())[message] += 1
-    return [f'  {name:28s}' + ', '.join(f'{s} {n}' for s, n in table[name].most_common()) for name in sorted(table)]
 
 
 def _names_none(r: Row) -> bool:

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import threading
 import time
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.records import IntArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.reading.arrivals import Arrival
@@ -128,33 +126,6 @@ def evaluated(name: str, lost: int, growth: int, errors: RunningDeviation) -> bo
     return good
 
 
-FRAME = np.dtype([('type', 'u1'), ('flags', 'u1'), ('seq', '<u4'), ('t', '<u8'), ('counts', '<i2', 6), ('crc', '<u4')])
-CRC_TABLE = np.array([zlib.crc32(bytes((255 ^ n,))) ^ zlib.crc32(b'\xff') for n in range(256)], np.uint32)
-"""CRC-32's own table, out of zlib's sums of one byte."""
-
-
-def sample_frames(seq: IntArray, t_us: IntArray, counts: IntArray) -> bytes:
-    """``encode(SampleFrame(0, ...))`` of many samples at once, one behind the other, 32 bytes each."""
-    frames = np.zeros(len(seq), FRAME)
-    frames['type'], frames['seq'], frames['t'], frames['counts'] = protocol.FrameType.SAMPLE, seq % 2**32, t_us, counts
-    payload = frames.view(np.uint8).reshape(len(seq), FRAME.itemsize)
-    size = FRAME.itemsize
-    crc = np.full(len(seq), 0xFFFFFFFF, np.uint32)
-    for column in payload[:, : size - 4].T:
-        crc = CRC_TABLE[(crc ^ column) & 0xFF] ^ (crc >> np.uint32(8))
-    frames['crc'] = ~crc
-    out = np.zeros((len(seq), size + 2), np.uint8)
-    out[:, 1:-1] = payload
-    # COBS: from the end to the front, each zero becomes the way to the next one.
-    following = np.full(len(seq), size + 1)
-    for place in range(size, 0, -1):
-        zero = out[:, place] == 0
-        out[zero, place] = (following - place)[zero]
-        following[zero] = place
-    out[:, 0] = following
-    return out.tobytes()
-
-
 def real_time(minutes: float) -> bool:
     import rclpy
     from geometry_msgs.msg import PoseStamped
@@ -230,13 +201,13 @@ def simulated_time(hours: float) -> bool:
         numbers = first + second + np.arange(1000)
         counts = rng.integers(-13, 14, (1000, 6))
         counts[:, [2, 5]] += 16384
-        encoded = sample_frames(numbers, numbers * 1000, counts)
+        pairs = zip(numbers.tolist(), counts.tolist(), strict=True)
+        encoded = [protocol.encode(protocol.SampleFrame(0, n % 2**32, n * 1000, tuple(c))) for n, c in pairs]
         late = rng.exponential(50_000, 50).astype(np.int64).tolist()
         for number, read in enumerate(late):
             true_last = round((second + 20 * number + 19) * MS / (1.0 + SKEW))
             arrival = -(-true_last // MS) * MS + 200_000 + read
-            size = 20 * (FRAME.itemsize + 2)
-            piece = encoded[number * size : (number + 1) * size]
+            piece = b''.join(encoded[20 * number : 20 * number + 20])
             acquisition.feed(decoder.feed(piece + (once_a_second if number == 0 else b'')), arrival)
             while not acquisition.queue.empty():
                 item = acquisition.queue.get()
