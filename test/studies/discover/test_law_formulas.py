@@ -461,6 +461,7 @@ def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch
     names = list(variables_of(2))
     scored = [law_features.Scored('y2', LawTerm('product', (v,)), 100.0 - i) for i, v in enumerate(names)]
     scored.insert(1, dataclasses.replace(scored[0], gain=99.5))
+    scored.append(dataclasses.replace(scored[0], target='y1', gain=80.0))
     monkeypatch.setattr(laws, 'score', lambda *_: scored)
     seeker = Given({(v, ''): 100.0 - i for i, v in enumerate(names)})
     got = seeker.first()

@@ -430,19 +430,20 @@ def test_simulation_error_counts_only_where_it_explains(gain: float, channel: in
     ],
 )
 def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tuple[str, ...], equal: bool) -> None:
-    shown = pictures(A)
-    search = search_of(Plant(shown, without_noise((shown[A], 500.0))))
-    fit = refit(search.workspace, [active('a', x=0.0)])
+    shown = pictures(A, ('c', 'x'))
+    search = search_of(Plant(shown, without_noise((shown[A], 500.0), (shown['c', 'x'], 500.0))))
+    both = [active('a', x=0.0), active('c', x=0.0)]
+    fit = refit(search.workspace, both)
     other = dataclasses.replace(
         fit,
-        effects=(active('b', **dict.fromkeys(names, 0.0)),),
+        effects=(fit.effects[1], active('b', **dict.fromkeys(names, 0.0))),
         chi2=fit.chi2 + loss,
-        free=tuple((0, n) for n in names),
-        jacobian=np.zeros((N, len(names))),
+        free=((0, 'x'), *((1, n) for n in names)),
+        jacobian=np.zeros((N, 1 + len(names))),
     )
-    result = result_of(search, [active('a', x=0.0)], [[other]])
-    result = dataclasses.replace(result, fit=fit)
-    (named,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
+    result = dataclasses.replace(result_of(search, both, [[other], []]), fit=fit)
+    named, beside = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)] * 2)).named
+    assert (beside.equivalent, beside.alternatives, beside.suggestion) == ((), (), None)
     assert named.equivalent == (('b',) if equal else ())
     assert (named.suggestion is not None) == equal
     ((name, lost, bic),) = named.alternatives

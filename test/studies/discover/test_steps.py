@@ -21,6 +21,7 @@ from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.search import search as steps
 from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import dependences, localise, regressors
@@ -99,6 +100,25 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
     result = ran(searching(plant, shown, 'abcd', message))
     assert 'a better pair: ' in ''.join(message)
     assert named(result.fit) == ['a', 'b']
+
+
+@pytest.mark.parametrize(('late', 'again'), [(1.2, True), (0.8, False)])
+def test_effects_beside_late_loads_are_simulated_anew(late: float, again: bool) -> None:
+    """If the delay closes more than half of a large chi-square, and no effect as it was simulated the rest."""
+    shown = pictures(('load_delay', 'x'), B, C)
+    rest = 20.0 * 6 * FINE
+    plant = Plant(shown, without_noise((shown['load_delay', 'x'], late * rest), (shown[C], rest)) + noise())
+    found = [(candidate(n, 'x'), [[1e-3 * shown[n, 'x']]]) for n in ('load_delay', 'b')]
+    beside: list[Fit | None] = []
+
+    def screen(ws: Comparison, fit: Fit | None) -> Screen:
+        beside.append(fit)
+        return Screen(ws, found)
+
+    search = Search(plant, screen)
+    null = refit(plant, ())
+    assert mistake(search, null, search.screen.score(null.residual)) is null
+    assert [named(fit) for fit in beside if fit] == [['load_delay']] * again
 
 
 def test_another_sample_rate_is_tried_from_afar() -> None:
