@@ -33,8 +33,8 @@ from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, notify
 from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.devices.protocol.frames import FrameDecoder, SampleFrame, encode
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.model.simulation.effect_words import with_effects_of
-from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.model.simulation.catalogue import with_effects_of
+from psd_deflection.model.simulation.loads import load_history
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.conversion import Beside, convert

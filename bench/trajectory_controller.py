@@ -67,8 +67,7 @@ class ServedController:
 
     def __init__(self, node: Any, names: Sequence[str], controller: TrajectoryController, name: str = ACTION) -> None:
         # The stand-in itself needs no ROS.
-        from psd_deflection.ros.actions import GuardedServer
-        from psd_deflection.ros.endpoints import action_class
+        from psd_deflection.ros.endpoints import GuardedServer, action_class
         from psd_deflection.ros.topics import FOLLOW, SERVED
 
         self.controller, self._names = controller, tuple(names)

@@ -12,8 +12,7 @@ from blind.generator import Array
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.validate.clock import Offset, clock_offset
-from psd_deflection.studies.validate.motion import Motion
+from psd_deflection.studies.validate.clock import Motion, Offset, clock_offset
 
 CENTERS = ((0.0, 0.07), (-0.1, 0.0))  # m, of the thesis rig.
 MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))  # Hz, and m, m, rad a step.

@@ -20,8 +20,8 @@ from blind.cases import designs, gap_of
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery
-from psd_deflection.studies.discover.search.signatures import SignatureBank
+from psd_deflection.studies.discover.report import Discovery
+from psd_deflection.studies.discover.search.screen import SignatureBank
 
 _BANK = SignatureBank()
 STAGES = tuple(law_forms.OF_STAGE)

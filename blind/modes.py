@@ -13,8 +13,8 @@ from scipy.signal import lfilter
 
 from blind.campaign import options, watched
 from blind.generator import Array
-from psd_deflection.studies.identify.axis_modes import Mode
 from psd_deflection.studies.identify.modes import modes_of
+from psd_deflection.studies.identify.spectra import Mode
 
 RATE = 1000.0
 

@@ -19,8 +19,8 @@ from blind.mistakes import observed
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery
-from psd_deflection.studies.discover.search.signatures import SignatureBank
+from psd_deflection.studies.discover.report import Discovery
+from psd_deflection.studies.discover.search.screen import SignatureBank
 
 _BANKS: dict[str, SignatureBank] = {}
 

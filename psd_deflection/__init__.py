@@ -51,9 +51,9 @@ if TYPE_CHECKING:
     from psd_deflection.studies.check.result import Checkup
     from psd_deflection.studies.discover.plant_search import PlantDiscovery
     from psd_deflection.studies.discover.plants import Plant
-    from psd_deflection.studies.discover.result import Discovery
-    from psd_deflection.studies.identify.result import Identified
-    from psd_deflection.studies.validate.result import Validated
+    from psd_deflection.studies.discover.report import Discovery
+    from psd_deflection.studies.identify.identify import Identified
+    from psd_deflection.studies.validate.validate import Validated
     from psd_deflection.studies.watch.result import WatchedRun
 
 __version__ = '0.1.0'
@@ -180,8 +180,8 @@ def simulate(
     Raises :class:`psd_deflection.base.errors.ConfigError` naming argument, value and bound.
     """
     from psd_deflection.base.errors import ConfigError
-    from psd_deflection.model.simulation.effect_words import with_effects_of
-    from psd_deflection.model.simulation.load_words import load_history, load_table, temperature_table
+    from psd_deflection.model.simulation.catalogue import with_effects_of
+    from psd_deflection.model.simulation.loads import load_history, load_table, temperature_table
     from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 
     known = with_effects_of(_rig(rig), (), 'effects')

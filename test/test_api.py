@@ -22,7 +22,7 @@ import pytest
 import psd_deflection
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError, SolverError
 from psd_deflection.cli.main import main
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from tools.program import ROOT
 
 CLEAN = ROOT / 'bags' / 'clean'

@@ -16,8 +16,8 @@ import yaml
 from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.ros import names
 from psd_deflection.ros import topics as table
+from psd_deflection.ros.topics import BASE, SERVICES
 
 pytestmark = pytest.mark.slow
 
@@ -81,7 +81,7 @@ def test_rviz() -> None:
     tree = yaml.safe_load((CONFIG / 'link_tip.rviz').read_text())
     displays = [d for d in tree['Visualization Manager']['Displays'] if d['Class'].endswith('MarkerArray')]
     assert {d['Topic']['Value'] for d in displays} == {table.MARKERS, table.MARKERS_AT_REST}
-    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == names.BASE
+    assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == BASE
     # A subscriber that asks for more than the publisher gives is not connected at all.
     for topic in (d['Topic'] for d in displays):
         given = table.PUBLISHED[topic['Value']].delivery
@@ -98,7 +98,7 @@ def test_the_sros2_policy() -> None:
     topics = {t.text for t in root.iter('topic')} - of_every_node - {'*', '/link_tip/*'}
     assert topics <= {*TOPIC_TYPES, table.TF, table.TF_STATIC}
     assert topics >= set(INPUTS)
-    served = {name.replace('~', '/estimator') for name in names.SERVICES}
+    served = {name.replace('~', '/estimator') for name in SERVICES}
     requested = {
         path: {s.text for g in e.iter('services') if 'request' in g.attrib for s in g} for path, e in enclaves.items()
     }

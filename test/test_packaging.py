@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection import __version__
-from psd_deflection.base import optional
+from psd_deflection.base import plugins
 from psd_deflection.cli.main import main
 
 ROOT = Path(__file__).parent.parent
@@ -167,10 +167,10 @@ def test_the_three_lists_of_dependencies_agree() -> None:
     assert named == {key for key in keys.values() if key != 'none yet'}
 
 
-@pytest.mark.parametrize('name', sorted(optional.EXTRAS))
+@pytest.mark.parametrize('name', sorted(plugins.EXTRAS))
 def test_a_missing_package_is_named_with_what_brings_it(name: str) -> None:
-    error = optional.not_installed(ModuleNotFoundError(f'No module named {name}', name=f'{name}.inside'))
-    extra, apt = optional.EXTRAS[name]
+    error = plugins.not_installed(ModuleNotFoundError(f'No module named {name}', name=f'{name}.inside'))
+    extra, apt = plugins.EXTRAS[name]
     always, extras = requirements()
     assert (extra == extras[name]) if extra else name in always
     assert str(error).startswith(f'{name} is not installed: `pip install ')

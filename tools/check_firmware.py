@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 from psd_deflection.base.log import texts
+from psd_deflection.devices.ports import SerialPort
 from psd_deflection.devices.protocol import frames as protocol
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.records import Record, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.session import Session

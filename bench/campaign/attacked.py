@@ -25,8 +25,7 @@ from bench.simulated_arm import largest_step
 from blind.render import Pose, Scene, photograph
 from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
 from psd_deflection.arms.compensation.compensator import State
-from psd_deflection.arms.compensation.settings import CompensatorSettings
-from psd_deflection.arms.compensation.shaping import ShaperSettings
+from psd_deflection.arms.compensation.settings import CompensatorSettings, ShaperSettings
 from psd_deflection.arms.compensation.trajectory import KINK_S, Trajectory
 from psd_deflection.arms.inputs import REST_S
 from psd_deflection.base.log import null_log
@@ -39,8 +38,8 @@ from psd_deflection.ros.compensator import CompensatorNode
 from psd_deflection.ros.estimator import EstimatorNode
 from psd_deflection.ros.node import BaseNode
 from psd_deflection.ros.shaper import ShaperNode
+from psd_deflection.run.realtime import Signals
 from psd_deflection.run.session import Session
-from psd_deflection.run.signals import Signals
 from tools.program import ROOT
 
 URDF = ROOT / 'config' / 'two_links.urdf'

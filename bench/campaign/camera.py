@@ -15,13 +15,13 @@ from scipy.ndimage import gaussian_filter
 
 from blind import render
 from blind.campaign import conclude, options
-from psd_deflection.camera import aruco
+from psd_deflection.camera import boards
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
-from psd_deflection.camera.targets import target_of
+from psd_deflection.camera.target import target_of
 
 REST = 4
 RUN = 20  # Frames of one rendered rig, after those at rest.
@@ -290,7 +290,7 @@ def board_picture(settings: CameraSettings) -> Any:
     """How a board of these settings is drawn: (scene, pose) -> grey levels without noise."""
     target = _board(settings)
     size = target.size
-    texture = aruco.picture(target.board, (round(size[0] * 2e4), round(size[1] * 2e4))) / 255.0
+    texture = boards.picture(target.board, (round(size[0] * 2e4), round(size[1] * 2e4))) / 255.0
 
     def picture(scene: render.Scene, pose: render.Pose) -> Any:
         return render.board(scene, pose, texture, size)

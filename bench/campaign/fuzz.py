@@ -220,7 +220,7 @@ def hello_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, encode
     from psd_deflection.records import CHANNELS
     from psd_deflection.rig.config import load_rig
-    from psd_deflection.run.reading.hello import HelloGate
+    from psd_deflection.run.hello import HelloGate
 
     rig = load_rig()
     good: dict[str, object] = {

@@ -22,8 +22,8 @@ from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Arrival
 from tools.program import PSD_DEFLECTION, Program
 
 SKEW = 30e-6

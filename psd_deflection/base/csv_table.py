@@ -12,8 +12,7 @@ from typing import NamedTuple, TextIO
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.foreign_tables import text_fault, what_of_header, why_no_number
-from psd_deflection.base.numbers import NUMBER
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import NUMBER, sanitize
 
 MAX_LINE = 10_000
 """Maximum characters of a line; a longer line is not a row of a table."""

@@ -12,8 +12,7 @@ from collections.abc import Collection, Sequence
 from pathlib import PurePath
 from typing import BinaryIO, NamedTuple
 
-from psd_deflection.base.sanitize import sanitize
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean, sanitize
 
 OUT = 'OUT.csv'
 LONGEST_HEADER = 120

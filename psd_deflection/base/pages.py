@@ -9,8 +9,7 @@ import hashlib
 import html
 from collections.abc import Iterable, Sequence
 
-from psd_deflection.base.charts import MARK
-from psd_deflection.base.page_files import CHARTS, FOLDER, UPLOT, UPLOT_STYLE, joined, text
+from psd_deflection.base.charts import CHARTS, FOLDER, MARK, UPLOT, UPLOT_STYLE, joined, text
 
 STYLE = """
 :root{color-scheme:light dark;--bg:#fff;--text:#222;--quiet:#5d5d5d;--line:#ddd;--card:#f3f6fa;--grid:#e6ebf0;

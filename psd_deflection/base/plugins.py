@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Loads code of other packages and of the user: whatever it does on import, the caller gets one error that names it."""
+"""Loads code of other packages: whatever it does on import, the caller gets one error that names it or its extra."""
 
 from __future__ import annotations
 
@@ -21,3 +21,22 @@ def loaded(what: str, load: Callable[[], T]) -> T:
     except (Exception, SystemExit, GeneratorExit) as error:
         # A plug-in that exits must not take the program along, with a status that means something else.
         raise ConfigError(f'{what} ({type(error).__name__}: {error})') from error
+
+
+EXTRAS = {
+    'matplotlib': ('plot', 'python3-matplotlib'),
+    'shtab': ('completion', ''),
+    'lz4': ('lz4', 'python3-lz4'),
+    'zstandard': ('', 'python3-zstandard'),
+}
+"""By the imported name: the extra of setup.cfg ('': a dependency that rosdep cannot name) and the package of apt."""
+
+
+def not_installed(error: ModuleNotFoundError) -> ConfigError | None:
+    """Return the error that says how to install the missing package; None if it is none of ``EXTRAS``."""
+    name = (error.name or '').partition('.')[0]
+    if name not in EXTRAS:
+        return None
+    extra, apt = EXTRAS[name]
+    pip = f"`pip install 'psd_deflection[{extra}]'`" if extra else f'`pip install {name}`'
+    return ConfigError(f'{name} is not installed: {pip}' + (f' or `apt install {apt}`' if apt else ''))

@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.sanitize import sanitize
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean, sanitize
 
 if TYPE_CHECKING:
     import pandas

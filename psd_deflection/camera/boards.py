@@ -4,28 +4,118 @@
 
 The board's middle is ``link_tip``'s origin; seen from its front, its columns run to the right. Corners are matched
 by the numbers in the markers, so a board has no half turn, and may be partly hidden.
-OpenCV makes and finds them (:mod:`psd_deflection.camera.aruco`).
 """
 
 from __future__ import annotations
 
 import abc
 import math
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.camera import aruco
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
-from psd_deflection.camera.discs.rim_model import rotation_matrix
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.refine_corners import LEAST_REACH, refined
+from psd_deflection.camera.rim_model import rotation_matrix
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.target import Drawing, Target
 from psd_deflection.records import FloatArray
+
+Corners = Any
+"""Corners of markers in the image, px, four by four, or of the chessboard, as OpenCV has them."""
+
+
+def has_boards() -> bool:
+    """Return whether this OpenCV makes and finds boards.
+
+    4.6 (Ubuntu 24.04's) has them only where opencv_contrib was built with it, as Ubuntu does. Older ones have other
+    axes.
+    """
+    aruco = getattr(opencv(), 'aruco', None)
+    return hasattr(aruco, 'CharucoDetector') or (hasattr(aruco, 'CharucoBoard_create') and _version() >= (4, 6))
+
+
+def _version() -> tuple[int, ...]:
+    return tuple(int(n) for n in re.findall(r'\d+', opencv().__version__)[:2])
+
+
+def _old() -> bool:
+    return not hasattr(opencv().aruco, 'CharucoDetector')
+
+
+def charuco_board(columns: int, rows: int, square: float, marker: float, dictionary: Any) -> Any:
+    """OpenCV's chessboard with markers; ``square``, ``marker``: sides, m."""
+    aruco = opencv().aruco
+    if _old():
+        return aruco.CharucoBoard_create(columns, rows, square, marker, dictionary)
+    return aruco.CharucoBoard((columns, rows), square, marker, dictionary)
+
+
+def tag_board(columns: int, rows: int, marker: float, gap: float, dictionary: Any) -> Any:
+    """OpenCV's grid of markers; ``marker``: side, ``gap``: between two of them, m."""
+    aruco = opencv().aruco
+    if _old():
+        return aruco.GridBoard_create(columns, rows, marker, gap, dictionary)
+    return aruco.GridBoard((columns, rows), marker, gap, dictionary)
+
+
+def picture(board: Any, pixels: tuple[int, int]) -> Any:
+    """Return the board as OpenCV draws it, (height, width) grey; ``pixels``: width and height."""
+    draw = board.draw if _old() else board.generateImage
+    return draw(pixels, None, 0, 1)
+
+
+def chessboard_corners(board: Any) -> Any:
+    """(n, 3): inner corners of the chessboard by number, m, in OpenCV's axes."""
+    return board.chessboardCorners if _old() else board.getChessboardCorners()
+
+
+def tag_corners(board: Any) -> dict[int, Any]:
+    """(4, 3): corners of each tag by its number, m, in OpenCV's axes."""
+    numbers, corners = (board.ids, board.objPoints) if _old() else (board.getIds(), board.getObjPoints())
+    return {int(number): at for number, at in zip(numbers.ravel(), corners, strict=True)}
+
+
+def tag_finder(dictionary: Any) -> Callable[[Any], tuple[Corners, Any]]:
+    """Takes a grey image; gives the corners of the markers in it and their numbers (None if there are none)."""
+    aruco = opencv().aruco
+    if _old():
+        old = aruco.DetectorParameters_create()
+        old.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+        return lambda grey: aruco.detectMarkers(grey, dictionary, parameters=old)[:2]
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+    detector = aruco.ArucoDetector(dictionary, parameters)
+    return lambda grey: detector.detectMarkers(grey)[:2]
+
+
+def corner_finder(board: Any, dictionary: Any) -> Callable[[Any], tuple[Corners, Any, bool]]:
+    """Takes a grey image; gives corners of the chessboard, their numbers (None: none are seen), if a marker is seen."""
+    aruco = opencv().aruco
+    if not _old():
+        detector = aruco.CharucoDetector(board)
+
+        def found(grey: Any) -> tuple[Corners, Any, bool]:
+            pixels, numbers, _, markers = detector.detectBoard(grey)
+            return pixels, numbers, markers is not None and len(markers) > 0
+
+        return found
+
+    def found_by_46(grey: Any) -> tuple[Corners, Any, bool]:
+        corners, markers, _ = aruco.detectMarkers(grey, dictionary)
+        if markers is None:
+            return None, None, False
+        _, pixels, numbers = aruco.interpolateCornersCharuco(corners, markers, grey, board)
+        return pixels, numbers, True
+
+    return found_by_46
+
 
 LEAST_CORNERS = 8
 LEAST_RATIO = 0.35
@@ -105,7 +195,7 @@ class Board(Target):
         wide, high = self.size
         across = self.settings.columns * _PIXELS_A_COLUMN
         pixels = (across, round(across * high / wide))
-        return Drawing(self.size, picture=np.asarray(aruco.picture(self.board, pixels)))
+        return Drawing(self.size, picture=np.asarray(picture(self.board, pixels)))
 
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
         """See :class:`Target`."""
@@ -238,7 +328,7 @@ def _fitted(
 
 def _dictionary(settings: CameraSettings, needed: int) -> Any:
     """OpenCV's dictionary, of at least ``needed`` markers. Raises ConfigError."""
-    if not aruco.has_boards():
+    if not has_boards():
         raise ConfigError(
             f'OpenCV {opencv().__version__} has no boards; target.kind {settings.target} needs 4.7 or later, or '
             "Ubuntu's 4.6: `pip install 'psd_deflection[camera]'` in a virtual environment (Ubuntu's own pip rejects "
@@ -273,15 +363,15 @@ class Charuco(Board):
 
     def __init__(self, settings: CameraSettings) -> None:
         super().__init__(settings)
-        self._corners = aruco.chessboard_corners(self.board)
-        self._find = aruco.corner_finder(self.board, self._dictionary)
+        self._corners = chessboard_corners(self.board)
+        self._find = corner_finder(self.board, self._dictionary)
 
     def _needed(self, settings: CameraSettings) -> int:
         return settings.columns * settings.rows // 2
 
     def _made(self) -> Any:
         s = self.settings
-        return aruco.charuco_board(s.columns, s.rows, s.square, s.marker, self._dictionary)
+        return charuco_board(s.columns, s.rows, s.square, s.marker, self._dictionary)
 
     def _size(self) -> tuple[float, float]:
         s = self.settings
@@ -312,15 +402,15 @@ class AprilTags(Board):
 
     def __init__(self, settings: CameraSettings) -> None:
         super().__init__(settings)
-        self._find = aruco.tag_finder(self._dictionary)
-        self._by_id = aruco.tag_corners(self.board)
+        self._find = tag_finder(self._dictionary)
+        self._by_id = tag_corners(self.board)
 
     def _needed(self, settings: CameraSettings) -> int:
         return settings.columns * settings.rows
 
     def _made(self) -> Any:
         s = self.settings
-        return aruco.tag_board(s.columns, s.rows, s.marker, s.gap, self._dictionary)
+        return tag_board(s.columns, s.rows, s.marker, s.gap, self._dictionary)
 
     def _size(self) -> tuple[float, float]:
         s = self.settings

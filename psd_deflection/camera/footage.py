@@ -19,8 +19,7 @@ from psd_deflection.base.csv_table import CsvTable, Row
 from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_text
 from psd_deflection.camera.answer import NoPoseError
-from psd_deflection.camera.image_size import MOST_BYTES, MOST_PIXELS, checked
-from psd_deflection.camera.opencv import opencv
+from psd_deflection.camera.opencv import MOST_BYTES, MOST_PIXELS, checked, opencv
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.rig.parameter_files import flattened, parameter_text
 

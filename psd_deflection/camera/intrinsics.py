@@ -14,7 +14,7 @@ from psd_deflection.camera.answer import NoPoseError, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings
-from psd_deflection.camera.targets import target_of
+from psd_deflection.camera.target import target_of
 from psd_deflection.records import FloatArray
 
 LEAST_IMAGES = 5

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,9 +12,22 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.camera.kinds import TARGETS, target_class
 from psd_deflection.camera.lens import Lens
 from psd_deflection.rig.parameters import Section, parameter
+
+TARGETS: Mapping[str, str] = {
+    'circles': 'psd_deflection.camera.discs:Discs',
+    'charuco': 'psd_deflection.camera.boards:Charuco',
+    'apriltag': 'psd_deflection.camera.boards:AprilTags',
+}
+"""``target.kind`` to module and class, the default first."""
+
+
+def target_class(kind: str) -> Any:
+    """The class of that ``target.kind``, derived from :class:`.target.Target`, which needs the settings first."""
+    module, name = TARGETS[kind].split(':')
+    return getattr(importlib.import_module(module), name)
+
 
 VIEWS = ('outside', 'base')
 _LENGTH: Mapping[str, Any] = {'minimum': 1e-6, 'maximum': 100.0, 'live': True}

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from psd_deflection.camera.answer import TargetPose
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.settings import SETTINGS, CameraSettings
+from psd_deflection.camera.settings import SETTINGS, CameraSettings, target_class
 
 
 class Drawing(NamedTuple):
@@ -65,3 +65,9 @@ class Target(abc.ABC):
 
 def _setting_words(value: object) -> str:
     return f'{value:g}' if isinstance(value, float) else str(value)
+
+
+def target_of(settings: CameraSettings) -> Target:
+    """Return the finder of the target that ``settings`` name. Raises ConfigError."""
+    target: Target = target_class(settings.target)(settings)
+    return target

@@ -16,7 +16,7 @@ from pathlib import Path
 from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import RecordingError, SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING
-from psd_deflection.cli._program import program
+from psd_deflection.cli._report import program
 from psd_deflection.run.session import Session
 
 REFRESH_S = 0.25

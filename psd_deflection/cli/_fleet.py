@@ -18,10 +18,8 @@ from psd_deflection.base.errors import SomeFailedError, UsageError
 from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import make_folder, make_writable
 from psd_deflection.cli._report import print_json, save_all, show, show_text, warn
-from psd_deflection.run.fleet.engines import FORMS, SERIAL, check_engine, open_engine
-from psd_deflection.run.fleet.listing import is_plain, listed
 from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
-from psd_deflection.run.fleet.tasks import Outcome, outcomes
+from psd_deflection.run.fleet.tasks import FORMS, SERIAL, Outcome, check_engine, is_plain, listed, open_engine, outcomes
 
 T = TypeVar('T')
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import importlib.util
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -14,17 +15,18 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.base.errors import ConfigError, MachineError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 from psd_deflection.cli._values import given_as_option
-from psd_deflection.recordings.formats.registry import formats
+from psd_deflection.recordings.formats.format import formats
 from psd_deflection.recordings.spans import FULL, MARK_WORD, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.rig.parameters import Parameter, Section, Value, check_value
 from psd_deflection.run.fleet.parquet import ENDING, is_parquet
+from psd_deflection.run.realtime import SHARED_MEMORY, shared_memory_left
 
 _FOREIGN = """
 .7z .arrow .avi .bag .bmp .bz2 .db .db3 .eps .feather .gif .gz .h5 .hdf .hdf5 .htm .html .jpeg .jpg .json .jsonl .log
@@ -296,3 +298,22 @@ def reject(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -
     for name, default in defaults.items():
         if getattr(args, name) != default:
             raise UsageError(f'--{name.replace("_", "-")} {why}')
+
+
+NEEDED_BYTES = 65_536
+"""The tracing of ROS 2 maps two pages of shared memory as it is imported; without room the system ends it by SIGBUS."""
+
+
+def require_ros(otherwise: str = '') -> None:
+    """Raise ConfigError if rclpy is not installed, MachineError if shared memory is full. ``otherwise``: what to do
+    instead, from ', ' on."""
+    if importlib.util.find_spec('rclpy') is None:
+        raise ConfigError(
+            f"rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`{otherwise}"
+        )
+    left = shared_memory_left()
+    if left < NEEDED_BYTES:
+        raise MachineError(
+            f'{SHARED_MEMORY} has {left} bytes left, ROS 2 needs {NEEDED_BYTES}: delete what nobody uses there, or '
+            f'make it larger (docker run --shm-size){otherwise}'
+        )

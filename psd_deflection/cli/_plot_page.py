@@ -14,7 +14,7 @@ import numpy as np
 
 import psd_deflection.run.monitor
 from psd_deflection import __version__
-from psd_deflection.base.page_files import CHARTS, UPLOT, UPLOT_STYLE, joined, packed, safe, text
+from psd_deflection.base.charts import CHARTS, UPLOT, UPLOT_STYLE, joined, packed, safe, text
 from psd_deflection.records import AppliedLoad, FloatArray, Mark, ReferencePose, dot_names
 from psd_deflection.rig.config import Rig
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,8 +13,7 @@ from typing import Any
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import replace_file
-from psd_deflection.base.json_text import json_text
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import json_text, sanitize
 
 LONGEST_LINE = 2000
 """Characters of a line with words of a file or of a device in it."""
@@ -62,3 +62,14 @@ def save_all(files: Mapping[str, str], folder: Path) -> None:
     """Write texts by their names; raises RecordingError as :func:`save` does."""
     for name, text in files.items():
         save(text.encode(errors='replace'), folder / name)
+
+
+NAME = 'psd-deflection'
+
+
+def program() -> str:
+    """``psd-deflection`` if the shell finds it; else the path that was used, as by ``make run`` from ``.venv/bin``."""
+    if shutil.which(NAME) is not None:
+        return NAME
+    called = Path(sys.argv[0])
+    return str(called) if called.name == NAME else f'{sys.executable} -m psd_deflection'

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from psd_deflection.base.errors import ConfigError, UsageError
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 
 N = TypeVar('N', int, float)
 

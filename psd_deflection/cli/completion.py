@@ -15,7 +15,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from psd_deflection.devices.port_names import SCHEMES
+from psd_deflection.devices.port import SCHEMES
 
 SHELLS = ('bash', 'zsh', 'tcsh')
 

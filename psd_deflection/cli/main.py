@@ -38,10 +38,8 @@ from psd_deflection.base.errors import (
     SomeFailedError,
     UsageError,
 )
-from psd_deflection.base.optional import not_installed
-from psd_deflection.base.plugins import loaded
-from psd_deflection.base.sanitize import sanitize
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.plugins import loaded, not_installed
+from psd_deflection.base.text import did_you_mean, sanitize
 from psd_deflection.cli._report import LONGEST_LINE
 
 if TYPE_CHECKING:

@@ -8,9 +8,12 @@ device's own clock.
 
 from __future__ import annotations
 
+import glob
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
+
+from serial.tools import list_ports
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import DeviceError
@@ -25,7 +28,7 @@ from psd_deflection.devices.device import (
     described,
     psds_of,
 )
-from psd_deflection.devices.port_search import candidate_ports, is_pattern, matching
+from psd_deflection.devices.port import network_address
 from psd_deflection.devices.port_source import PortSource
 from psd_deflection.devices.protocol.frames import (
     PROTOCOL_VERSION,
@@ -48,6 +51,38 @@ from psd_deflection.rig.config import Rig
 
 if TYPE_CHECKING:
     from psd_deflection.devices.rig_feed import RigFeed
+
+
+MAX_PORTS = 64
+
+
+def is_pattern(port: str) -> bool:
+    """Whether ``port`` is a pattern, which may match several ports."""
+    # [::1] is no pattern.
+    return network_address(port) is None and glob.has_magic(port)
+
+
+def matching(pattern: str) -> list[str]:
+    """The ports that match the pattern now."""
+    return sorted(glob.glob(pattern))[:MAX_PORTS]  # noqa: PTH207 - the pattern is a whole path
+
+
+def candidate_ports(port: str, wanted_serial: str) -> list[str]:
+    """Other ports where the device may have come back, the likeliest first.
+
+    A port whose USB descriptor has ``wanted_serial`` goes first. A port of the network is one place.
+
+    ``port`` may be a pattern (``/dev/ttyACM*``). Otherwise every USB serial port of the machine is a candidate,
+    besides the named port. A device is recognised by the serial number that it reports, never by the port's name.
+    """
+    if network_address(port) is not None:
+        return []
+    if is_pattern(port):
+        return matching(port)
+    ports = [p for p in list_ports.comports() if p.vid is not None and p.device != port]
+    ports.sort(key=lambda p: (p.serial_number != wanted_serial, p.device))
+    return [p.device for p in ports[:MAX_PORTS]]
+
 
 # The zero byte ends any frame that the device has received in part.
 _QUESTION = b'\x00' + encode(HelloRequestFrame())

@@ -8,8 +8,7 @@ import threading
 from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.errors import ConfigError, DeviceError
-from psd_deflection.devices.port import OpenPort
-from psd_deflection.devices.port_names import has_baud, network_address
+from psd_deflection.devices.port import OpenPort, has_baud, network_address
 from psd_deflection.devices.ports import open_port
 from psd_deflection.devices.source import Notice, Source
 from psd_deflection.devices.udp_port import Datagrams

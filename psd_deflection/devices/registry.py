@@ -20,7 +20,7 @@ from types import MappingProxyType
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.plugins import loaded
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.source import Source
 from psd_deflection.rig.config import Rig

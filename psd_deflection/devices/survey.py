@@ -20,8 +20,7 @@ from serial.tools import list_ports
 
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import Answer, Device, Probe
-from psd_deflection.devices.port import OpenPort
-from psd_deflection.devices.port_names import has_baud
+from psd_deflection.devices.port import OpenPort, has_baud
 from psd_deflection.devices.ports import open_port
 
 COMMON_BAUD = 115_200

@@ -24,8 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.devices.port import READ_SIZE, SLICE_S, OpenPort, waited_for
-from psd_deflection.devices.port_names import Address
+from psd_deflection.devices.port import READ_SIZE, SLICE_S, Address, OpenPort, waited_for
 from psd_deflection.devices.source import Notice, PortClosedError
 
 BIND_S = 2.0

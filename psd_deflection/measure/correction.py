@@ -22,8 +22,7 @@ from psd_deflection.measure.state import State, Value, mismatch
 from psd_deflection.model.plate.plate import flat_poses
 from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, Reading, Use, Values
-from psd_deflection.model.simulation.optics import dots_on_plate
-from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.physics import Physics, dots_on_plate
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import ENVIRONMENT, FloatArray, IntArray
 from psd_deflection.rig.config import Rig

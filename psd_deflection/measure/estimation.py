@@ -25,15 +25,14 @@ from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.consistency import ConsistencyResult, Unexplained, widened
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.model.detector import dot_noise_variances
-from psd_deflection.model.misalignment.parameter_covariance import ParameterCovariance
+from psd_deflection.model.misalignment.rig import ParameterCovariance
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
-from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
-from psd_deflection.model.solvers.one_psd import OnePsd
 from psd_deflection.model.solvers.registry import solver_class
-from psd_deflection.model.solvers.subset import subset_solver
+from psd_deflection.model.solvers.subset import NAME as ONE_PSD
+from psd_deflection.model.solvers.subset import OnePsd, subset_solver
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 

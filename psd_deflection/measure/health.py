@@ -18,7 +18,7 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.measures import BlockMeasures
+from psd_deflection.measure.averaging import BlockMeasures
 from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig

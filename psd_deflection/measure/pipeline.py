@@ -22,16 +22,15 @@ import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.averaging import BlockCutter, block_middle_ns
+from psd_deflection.measure.averaging import BlockCutter, BlockMeasures, block_middle_ns, measured, of_one_length
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
 from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, ValidBlock
 from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
-from psd_deflection.measure.measures import BlockMeasures, measured, of_one_length
-from psd_deflection.measure.motion.known import joined_ns, split_ns
+from psd_deflection.measure.motion.modal import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
 from psd_deflection.measure.state import FULL, STATE, Part, State, Value, load_states, numbers
 from psd_deflection.measure.uncertainty.block_fit import Fitted
-from psd_deflection.measure.uncertainty.rest import why_moving
+from psd_deflection.measure.uncertainty.vibration import why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.tip_load import TipLoads

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from psd_deflection import __version__
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 
 COMPUTES = ('psd_deflection', 'python', 'numpy', 'scipy')
 """Entries that the last digits of an estimate may depend on."""

@@ -18,15 +18,14 @@ import numpy.typing as npt
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.tables import Table, html_table
+from psd_deflection.base.text import sanitize
 from psd_deflection.measure.averaging import BlockCutter
 from psd_deflection.recordings.charts import moments, samples_chart
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.read.allowance import Warnings
-from psd_deflection.recordings.read.grid import digest_of
+from psd_deflection.recordings.mcap_format import Warnings
 from psd_deflection.recordings.read.mcap_reader import RawMessage
-from psd_deflection.recordings.sample_table import sample_dtype, samples_table
+from psd_deflection.recordings.sample_table import digest_of, sample_dtype, samples_table
 from psd_deflection.recordings.spans import Bound, span_ns
 from psd_deflection.records import (
     RESTART,

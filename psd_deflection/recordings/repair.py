@@ -20,8 +20,15 @@ from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder, lock
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
-from psd_deflection.recordings.mcap_format import MAGIC, Channel, McapMessage, McapRecord, Metadata, Schema
-from psd_deflection.recordings.read.allowance import DamagedError
+from psd_deflection.recordings.mcap_format import (
+    MAGIC,
+    Channel,
+    DamagedError,
+    McapMessage,
+    McapRecord,
+    Metadata,
+    Schema,
+)
 from psd_deflection.recordings.read.bag_reader import files_in, read_information
 from psd_deflection.recordings.read.mcap_reader import McapReader
 from psd_deflection.recordings.write.bag_metadata import (

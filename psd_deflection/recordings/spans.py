@@ -12,8 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.base.sanitize import sanitize
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean, sanitize
 from psd_deflection.records import Mark
 
 Bound = float | datetime | str

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.base.tables import html_table
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.declarations import (
     ACQUISITION,

@@ -14,7 +14,7 @@ from typing import Any
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import YamlError, edited, text_of_file, tree_of_text
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 
 MAX_KEYS = 10_000
 LONGEST_SOURCE = 4000

@@ -27,8 +27,7 @@ from typing import Any, Generic, Literal, TypedDict, TypeVar, Unpack, cast
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.numbers import plain_number
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean, plain_number
 
 Kind = Literal['double', 'integer', 'bool', 'string', 'double_array', 'string_array']
 Value = float | int | bool | str | list[float] | list[str]

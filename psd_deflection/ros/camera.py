@@ -28,7 +28,7 @@ from psd_deflection.camera.footage import decoded, of_ros_image
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import SETTINGS, CameraSettings
-from psd_deflection.camera.targets import target_of
+from psd_deflection.camera.target import target_of
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, ReferencePose
 from psd_deflection.ros.declared import DeclaredParameters

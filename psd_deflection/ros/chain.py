@@ -26,21 +26,27 @@ from psd_deflection.recordings import cdr
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import Parameter, Value, check_value
 from psd_deflection.ros.declared import SOURCE, DeclaredParameters, reject_unknown
-from psd_deflection.ros.names import BASE, END, END_REST, RECORD, REST, TIP, ZERO
 from psd_deflection.ros.node import AUTOSTART, BaseNode, Health, serve
 from psd_deflection.ros.running import ros
-from psd_deflection.ros.services import Zeroed, add_rig_services
-from psd_deflection.ros.sinks import InputRecorder, PublisherSink, topics_of
-from psd_deflection.ros.topics import JOINT_STATES, PUBLISHED
-from psd_deflection.ros.transforms import FramePublisher, installed, static_transforms, transform_message
+from psd_deflection.ros.sinks import (
+    FramePublisher,
+    InputRecorder,
+    PublisherSink,
+    Zeroed,
+    add_rig_services,
+    installed,
+    static_transforms,
+    topics_of,
+    transform_message,
+)
+from psd_deflection.ros.topics import BASE, END, END_REST, JOINT_STATES, PUBLISHED, RECORD, REST, TIP, ZERO
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN, HealthReporter
 from psd_deflection.run.fanout import subscribed
-from psd_deflection.run.realtime import Watchdog
+from psd_deflection.run.realtime import Signals, StopRequestedError, Watchdog
 from psd_deflection.run.rig_publisher import RigPublisher
 from psd_deflection.run.session import Session
 from psd_deflection.run.session_texts import why_no_zero, zero_text
-from psd_deflection.run.signals import Signals, StopRequestedError
 
 NODE_NAME = 'chain'
 OF_LINKS = (BY_NAME['record'], BY_NAME['bag_dir'])

@@ -45,15 +45,15 @@ from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.records import FloatArray
 from psd_deflection.ros.declared import DeclaredParameters, given_of
-from psd_deflection.ros.description import robot_description
 from psd_deflection.ros.endpoints import message_class
-from psd_deflection.ros.names import END_REST
+from psd_deflection.ros.gate import robot_description
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import (
     APPLIED,
     COMMANDS,
     CONTROLLER,
+    END_REST,
     JOINT_STATES,
     OFFSETS,
     PROPOSED,
@@ -65,7 +65,7 @@ from psd_deflection.ros.topics import (
 )
 from psd_deflection.run.diagnostics import ERROR, OK, WARN
 from psd_deflection.run.rate_limited_log import RateLimitedLog
-from psd_deflection.run.signals import StopRequestedError
+from psd_deflection.run.realtime import StopRequestedError
 
 NODE_NAME = 'compensator'
 ENABLE = '~/enable'

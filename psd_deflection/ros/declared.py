@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.rig.declarations import QOS_OVERRIDES_PREFIX, ROS_OWN
 from psd_deflection.rig.parameters import Parameter, Section, Value, check_value
 

@@ -26,12 +26,24 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, LogCallback
-from psd_deflection.base.sanitize import sanitize
-from psd_deflection.ros.actions import FAILURES, GuardedClient, GuardedServer
-from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, rejected_qos
-from psd_deflection.ros.topics import HEARD, MOST_GOALS, SERVED, GraphTopic
+from psd_deflection.base.text import sanitize
+from psd_deflection.ros.endpoints import (
+    FAILURES,
+    GuardedClient,
+    GuardedServer,
+    action_class,
+    graph_name,
+    message_class,
+    overriding,
+    qos,
+    rejected_qos,
+)
+from psd_deflection.ros.running import SPIN_S, executor_of
+from psd_deflection.ros.topics import HEARD, MOST_GOALS, ROBOT_DESCRIPTION, SERVED, GraphTopic
 from psd_deflection.run.rate_limited_log import RateLimitedLog
+from psd_deflection.run.realtime import Signals, StopRequestedError
 
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""
@@ -235,3 +247,50 @@ class GatedNode(LifecycleNode):  # type: ignore[misc]
                     self.gate.reject(topic, str(error))
 
         return super().create_subscription(msg_type, topic, guarded, *more, **options)
+
+
+WAIT_S = 30.0
+"""Time limit for it, s."""
+
+
+def listen_to_description(gate: InputGate, take: Callable[[str], None]) -> None:
+    """Let ``take`` have each text on ``robot_description``, the one that was published before, too.
+
+    A ConfigError of ``take`` rejects it.
+    """
+    gate.listen(ROBOT_DESCRIPTION, _fault, lambda message: take(message.data))
+
+
+def robot_description(
+    signals: Signals, log: LogCallback, wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
+) -> str:
+    """The text on ``robot_description`` in the namespace that the ROS arguments give; rclpy is started.
+
+    Raises ConfigError if none comes in ``wait_s``, s, and StopRequestedError if a signal comes
+    before it.
+    """
+    heard: list[str] = []
+    node = Node(f'{ROBOT_DESCRIPTION}_reader', start_parameter_services=False)
+    try:
+        gate = InputGate(node, log)
+        listen_to_description(gate, heard.append)
+        topic = node.resolve_topic_name(ROBOT_DESCRIPTION)
+        log(f'waiting for the robot on {topic}')
+        until = clock() + wait_s
+        with executor_of(node) as executor:
+            while not heard:
+                if signals.stop:
+                    raise StopRequestedError
+                if clock() >= until:
+                    why = gate.why.get(
+                        ROBOT_DESCRIPTION, 'nobody publishes it' if not node.count_publishers(topic) else 'none came'
+                    )
+                    raise ConfigError(f'{topic}: no description of the robot in {wait_s:g} s ({why}); give a URDF file')
+                executor.spin_once(timeout_sec=SPIN_S)
+    finally:
+        node.destroy_node()
+    return heard[0]
+
+
+def _fault(message: Any) -> str:
+    return '' if message.data.strip() else 'it is empty'

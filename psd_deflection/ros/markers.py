@@ -22,12 +22,11 @@ from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_adapters.orientation import quaternion
-from psd_deflection.model.plate.scene import Vector, bend, tip_boxes
+from psd_deflection.model.plate.layout import Vector, bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 from psd_deflection.rig.config import Rig
 from psd_deflection.ros.endpoints import publisher_of
-from psd_deflection.ros.names import BASE
-from psd_deflection.ros.topics import MARKERS, MARKERS_AT_REST
+from psd_deflection.ros.topics import BASE, MARKERS, MARKERS_AT_REST
 from psd_deflection.run.session import Session
 
 PERIOD_S = 0.1

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.run.signals import Signals
+from psd_deflection.run.realtime import Signals
 
 SPIN_S = 0.1
 """Longest time until a signal takes effect, s."""

@@ -30,8 +30,8 @@ from msg_adapters import (
     solver_topic,
     vector3_stamped,
 )
-from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.model.solvers.registry import SOLVERS
+from psd_deflection.model.solvers.subset import NAME as ONE_PSD
 from psd_deflection.records import MOST_PSDS
 
 MOST_BYTES = 1_000_000
@@ -302,3 +302,15 @@ SERVED: Mapping[str, GraphAction] = {
     )
 }
 """The actions that the nodes serve, by name."""
+
+
+END, END_REST = 'end_effector', 'end_effector_rest'
+"""Frames of a chain of links: the end effector, and where it were if no link bent."""
+
+ZERO, RECORD = '~/zero', '~/record'
+SERVICES = (ZERO, RECORD)
+"""Services of the node; ``~`` stands for the node's name."""
+
+BASE, REST, TIP = 'link_base', 'link_tip_rest', 'link_tip'
+PSDS = tuple(f'psd_{n}' for n in range(1, MOST_PSDS + 1))
+"""Frames: the clamp, the unloaded tip, the tip, the PSDs that a rig may have."""

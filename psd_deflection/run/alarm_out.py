@@ -27,8 +27,8 @@ from typing import IO
 from urllib.parse import urlsplit
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.json_text import json_text
 from psd_deflection.base.log import WARNING, LogCallback
+from psd_deflection.base.text import json_text
 from psd_deflection.measure.watch import Alarm
 
 COMMAND_S = 10.0

@@ -17,9 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from psd_deflection.arms.chains.chain import EndEffector
+from psd_deflection.arms.chains.chain import EndEffector, Joined, Joiner
 from psd_deflection.arms.chains.chain_file import ChainFile
-from psd_deflection.arms.chains.joining import Joined, Joiner
 from psd_deflection.base.log import INFO, LogCallback
 from psd_deflection.records import (
     BlockStatus,

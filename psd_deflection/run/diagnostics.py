@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from msg_adapters import ACCELERATION
 from psd_deflection.measure.motion.inertia import HOLD_NS
-from psd_deflection.measure.motion.innovations import Innovations
 from psd_deflection.measure.motion.motion import AXES
+from psd_deflection.measure.motion.unseen import Innovations
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.run.processing import Latency

@@ -16,7 +16,7 @@ from msg_adapters import (
     solver_topic,
     spot_topics,
 )
-from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
+from psd_deflection.model.solvers.subset import NAME as ONE_PSD
 from psd_deflection.recordings import cdr
 from psd_deflection.records import MOST_PSDS, ParameterChange, Record
 from psd_deflection.rig.config import Rig

@@ -15,13 +15,12 @@ from psd_deflection.base.log import LogCallback
 from psd_deflection.model.detector import counts_to_volts
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival, Ended
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Arrival, Ended
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.guide import Guide, Phase
-from psd_deflection.studies.check.levels import levels
-from psd_deflection.studies.check.result import Checkup
+from psd_deflection.studies.check.result import Checkup, levels
 
 LOOK_S = 0.2
 SILENT_LOOKS = 50

@@ -10,9 +10,8 @@ from typing import Protocol, TypeVar
 
 from psd_deflection.base.log import LogCallback
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.run.realtime import Watchdog, settle
+from psd_deflection.run.realtime import Signals, StopRequestedError, Watchdog, settle
 from psd_deflection.run.session import Session
-from psd_deflection.run.signals import Signals, StopRequestedError
 
 LOOK_S = 0.1
 

@@ -21,8 +21,8 @@ from typing import Any, Protocol, TypeVar
 from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.run.lag import lag_reason
-from psd_deflection.run.reading.arrivals import Annotation, Arrival, ItemQueue, Restarted
+from psd_deflection.run.arrivals import Annotation, Arrival, ItemQueue, Restarted
+from psd_deflection.run.realtime import lag_reason
 
 T = TypeVar('T')
 

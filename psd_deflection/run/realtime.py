@@ -1,20 +1,22 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a daemon requests from the system: locked memory, real-time priority for the reader, a watchdog.
-
-None of it is needed to run. The log says once what the system granted and what it rejected, with the reason
-(``docs/deploy``).
-"""
+"""What a process requests from the system: locked memory, real-time priority for the reader, a watchdog
+(``docs/deploy``); what the system asks of it: signals; and why a thread does not keep up."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
+import signal
 import socket
 import sys
+import threading
 import time
+import types
 from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
 
 SHARED_MEMORY = '/dev/shm'
 READER_PRIORITY = 50
@@ -117,3 +119,88 @@ class Watchdog:
     def stopping(self) -> None:
         """The daemon ends."""
         self._report('STOPPING=1')
+
+
+HELD_S = 1.0
+"""A thread that has made no step for so long is held up, unless it waits for a processor."""
+
+SLOW = 'this machine is too slow'
+_PACKAGE = 'psd_deflection.'
+_STATES = {'D': 'waits for the disk', 'T': 'is stopped'}
+
+
+def lag_reason(thread: threading.Thread, still_s: float) -> str:
+    """Why ``thread`` is behind, in words. ``still_s``: how long it has made no step, s."""
+    state = _state_of(thread)
+    if still_s < HELD_S or state == 'R':
+        return SLOW
+    place = _place_of(thread)
+    return f'{thread.name} {_STATES.get(state, "is held up")}' + (f' in {place}' if place else '')
+
+
+def _state_of(thread: threading.Thread) -> str:
+    """What the kernel says of it: R runs, or waits for a processor; '' if it does not say."""
+    try:
+        text = Path(f'/proc/self/task/{thread.native_id}/stat').read_text()
+    except OSError:
+        return ''
+    return text.rpartition(')')[2].split()[0]
+
+
+def _place_of(thread: threading.Thread) -> str:
+    """The innermost function of ours that it is in."""
+    frame = sys._current_frames().get(thread.ident or 0)  # noqa: SLF001
+    while frame is not None:
+        module = str(frame.f_globals.get('__name__', ''))
+        if module.startswith(_PACKAGE):
+            return f'{module.removeprefix(_PACKAGE)}.{frame.f_code.co_name}'
+        frame = frame.f_back
+    return ''
+
+
+T = TypeVar('T')
+
+
+class StopRequestedError(BaseException):
+    """A signal came while the main thread waited for a device. Like KeyboardInterrupt, it is not an Exception."""
+
+
+class Signals:
+    """Handles the signals from now on: they set ``stop``; inside :meth:`interruptible` they end the wait too.
+
+    SIGHUP (the terminal was closed, or the ssh connection broke) is one of them unless it is ignored
+    (``nohup``), so that the recording is completed. For the main thread only.
+
+    A signal that raised an exception anywhere would cut the last blocks off a recording. So the signal sets an
+    event, which the main loop checks. Only the wait for a device ends at once.
+    """
+
+    def __init__(self) -> None:
+        self.stop = False
+        self._raise = False
+        heard = [signal.SIGINT, signal.SIGTERM]
+        # Windows has none.
+        if hasattr(signal, 'SIGHUP') and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            heard.append(signal.SIGHUP)
+        self._previous = {s: signal.signal(s, self._received) for s in heard}
+
+    def _received(self, number: int, frame: types.FrameType | None) -> None:
+        self.stop = True
+        if self._raise:
+            self._raise = False
+            raise StopRequestedError
+
+    def interruptible(self, action: Callable[[], T]) -> T:
+        """Return ``action()``. A signal before or during it raises StopRequestedError."""
+        self._raise = True
+        try:
+            if self.stop:
+                raise StopRequestedError
+            return action()
+        finally:
+            self._raise = False
+
+    def restore(self) -> None:
+        """Restore the previous signal handlers."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)

@@ -31,7 +31,7 @@ from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.running import AcquisitionConfig
-from psd_deflection.run.lag import SLOW, lag_reason
+from psd_deflection.run.realtime import SLOW, lag_reason
 
 MESSAGES_PER_BLOCK = 100
 """The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes

@@ -20,17 +20,17 @@ from msg_adapters import ACCELERATION, LOAD, MARK, TOPIC_TYPES, accel_stamped, f
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
 from psd_deflection.base.errors import RecordingError, SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING, LogCallback
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.solvers.registry import check_arrangement, check_live
 from psd_deflection.recordings import cdr
 from psd_deflection.records import AppliedLoad, BaseAcceleration, Mark, ParameterChange, Record
 from psd_deflection.rig.config import Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.rig.declarations import ZEROS
+from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.processing import Processing, RecordSink
 from psd_deflection.run.rate_limited_log import RateLimitedLog
-from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.realtime import lock_memory
 from psd_deflection.run.recorder import Recorder
 from psd_deflection.run.session_texts import ANEW, load_text, mark_text, zero_text

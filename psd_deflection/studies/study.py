@@ -21,10 +21,9 @@ import yaml
 from psd_deflection.base.drawings import Drawing, in_page
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import replace_file
-from psd_deflection.base.json_text import json_text
 from psd_deflection.base.pages import page, table
-from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.tables import Table
+from psd_deflection.base.text import json_text, sanitize
 from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.recordings.read.readers import open_recording

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psd_deflection.base.arithmetic import FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
-from psd_deflection.base.arithmetic.elementary import FixedFunctions
+from psd_deflection.base.arithmetic.fixed import FixedFunctions
 from psd_deflection.base.arithmetic.matrices import pivots, surely_positive
 from psd_deflection.base.arithmetic.spectra import lagged_products, transform
 from psd_deflection.records import FloatArray
@@ -240,12 +240,12 @@ def test_nodes_and_weights_of_gauss_and_legendre(count: int) -> None:
 
 # What a block or a rig goes through on its way to an estimate. Rooms whole, but for what the table below names.
 PIPELINE = (
-    *('measure/averaging.py', 'measure/measures.py', 'measure/pipeline.py', 'measure/estimation.py'),
+    *('measure/averaging.py', 'measure/pipeline.py', 'measure/estimation.py'),
     *('measure/correction.py', 'model/detector/volts.py', 'measure/health.py', 'measure/motion'),
     *('measure/uncertainty', 'model/solvers', 'model/plate/plate.py', 'model/plate/landing.py'),
     *('model/plate/layout.py', 'model/plate/linear.py', 'model/misalignment/model.py'),
-    *('model/misalignment/parameter_covariance.py', 'model/misalignment/rig.py', 'model/link/statics.py'),
-    *('model/simulation/optics.py', 'model/simulation/physics.py', 'model/simulation/tip_load.py'),
+    *('model/misalignment/rig.py', 'model/link/statics.py'),
+    *('model/simulation/physics.py', 'model/simulation/tip_load.py'),
     *('model/simulation/effects/ambient_light.py', 'model/simulation/effects/axis_crosstalk.py'),
     *('model/simulation/effects/sensor_gain.py', 'model/simulation/effects/sensor_nonlinearity.py'),
     *('model/simulation/effects/sensor_rotation.py', 'model/simulation/effects/thermal_drift.py'),
@@ -259,7 +259,7 @@ NOT_OF_A_BLOCK = {
     ('model/solvers/base_pair.py', '_reject_what_is_unseen'): 'compares with a bound',
     ('model/solvers/pose.py', '__init__'): 'compares with a bound',
     ('measure/uncertainty/consistency.py', 'survival'): 'told in /diagnostics alone',
-    ('measure/uncertainty/rest.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
+    ('measure/uncertainty/vibration.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
     ('measure/pipeline.py', 'zero'): 'what it finds is recorded and not computed again',
     ('measure/averaging.py', 'block_middle_ns'): 'adds whole numbers',
     ('measure/uncertainty/noise.py', '_autocovariance'): 'adds whole numbers',

@@ -18,10 +18,10 @@ import psd_deflection
 from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError
 from psd_deflection.base.foreign_yaml import MAX_DEPTH, MAX_NODES, YamlError, edited, parse_yaml
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 from psd_deflection.camera.footage import Footage
 from psd_deflection.cli.main import main
-from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.model.simulation.loads import load_history
 from psd_deflection.recordings.read.bag_reader import read_information
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.budget.inputs import read_inputs

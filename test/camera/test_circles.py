@@ -15,7 +15,7 @@ from blind.render import Pose, Scene, camera_of, mean_of, over_exposure, photogr
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
-from psd_deflection.camera.targets import target_of
+from psd_deflection.camera.target import target_of
 
 STILL = [Pose()] * 2
 

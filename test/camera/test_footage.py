@@ -19,12 +19,12 @@ import pytest
 from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.camera import footage
 from psd_deflection.camera.answer import NoPoseError, Status
-from psd_deflection.camera.discs.find_discs import find_discs
+from psd_deflection.camera.discs import find_discs
 from psd_deflection.camera.footage import Footage, decoded, read_image, read_settings
-from psd_deflection.camera.image_size import MOST_BYTES, MOST_PIXELS, declared_size
+from psd_deflection.camera.opencv import MOST_BYTES, MOST_PIXELS, declared_size
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
-from psd_deflection.camera.targets import target_of
+from psd_deflection.camera.target import target_of
 
 
 def folder(path: Path, table: str) -> str:
@@ -213,7 +213,7 @@ def test_opencv_has_the_same_bound_for_what_is_not_known_here() -> None:
 
 def test_a_file_that_is_too_long_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(footage, 'MOST_BYTES', 1000)
-    monkeypatch.setattr('psd_deflection.camera.image_size.MOST_BYTES', 1000)
+    monkeypatch.setattr('psd_deflection.camera.opencv.MOST_BYTES', 1000)
     path = tmp_path / 'long.png'
     with path.open('wb') as stream:
         stream.truncate(MOST_BYTES)

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
-from psd_deflection.camera.discs.find_discs import find_discs
+from psd_deflection.camera.discs import find_discs
 from psd_deflection.camera.footage import of_ros_image
-from psd_deflection.camera.image_size import declared_size
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
+from psd_deflection.camera.opencv import declared_size
 from psd_deflection.camera.reference import CameraReference, mean_pose, relative, relative_covariance
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.records import FloatArray

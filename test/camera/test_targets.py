@@ -15,17 +15,15 @@ import pytest
 
 from blind.render import Pose, Scene, board, developed
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.camera import aruco, boards
+from psd_deflection.camera import boards
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.intrinsics import calibrated
-from psd_deflection.camera.kinds import TARGETS, target_class
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.print_target import printed
 from psd_deflection.camera.reference import CameraReference
-from psd_deflection.camera.settings import SETTINGS, CameraSettings
-from psd_deflection.camera.target import Drawing, Target
-from psd_deflection.camera.targets import target_of
+from psd_deflection.camera.settings import SETTINGS, TARGETS, CameraSettings, target_class
+from psd_deflection.camera.target import Drawing, Target, target_of
 
 SCENE = Scene(width=640, height=480, focal=2000.0, centre=(325.0, 236.0), distance=0.42)
 MOVED = Pose(2e-3, -1e-3, math.radians(2.0), 0.02, -0.01)
@@ -119,7 +117,7 @@ def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Gene
     target = target_of(settings)
     assert isinstance(target, Board)
     pixels = (round(target.size[0] * 2e4), round(target.size[1] * 2e4))
-    texture = aruco.picture(target.board, pixels) / 255.0
+    texture = boards.picture(target.board, pixels) / 255.0
     return developed(scene, board(scene, pose, texture, target.size), rng)
 
 
@@ -238,7 +236,7 @@ def test_an_opencv_without_boards_is_rejected_with_the_fix(
 ) -> None:
     old = SimpleNamespace(__version__=version, aruco=SimpleNamespace(DICT_4X4_50=0, **there))
     monkeypatch.setattr(boards, 'opencv', lambda: old)
-    monkeypatch.setattr(aruco, 'opencv', lambda: old)
+    monkeypatch.setattr(boards, 'opencv', lambda: old)
     with pytest.raises(
         ConfigError, match=rf'OpenCV {version} has no boards; target.kind {kind} .* virtual environment'
     ):

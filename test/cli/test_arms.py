@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.arms.compensation.shaping import SHAPING, shaper_of
+from psd_deflection.arms.compensation.settings import SHAPING, shaper_of
 from psd_deflection.arms.shapers import Shaper, in_series, recommended, shaper
 from psd_deflection.cli._options import of_options
 from psd_deflection.cli.main import main, make_parser

@@ -14,8 +14,7 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.arms.compensation.settings import SETTINGS
-from psd_deflection.arms.compensation.shaping import SHAPING
+from psd_deflection.arms.compensation.settings import SETTINGS, SHAPING
 from psd_deflection.base.errors import EXIT_STATUSES, UsageError
 from psd_deflection.cli import _options
 from psd_deflection.cli.main import COMMANDS, GROUPS, main, make_parser

@@ -27,9 +27,9 @@ from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.serve import serve
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.run.reading import acquisition
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival
+from psd_deflection.run import acquisition
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Arrival
 from test.heard import WAIT_S
 
 

@@ -21,9 +21,8 @@ from serial import rfc2217
 
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices import PortClosedError, tcp_port, udp_port
-from psd_deflection.devices.port import OpenPort
-from psd_deflection.devices.port_names import Address, has_baud, network_address
-from psd_deflection.devices.port_search import candidate_ports, is_pattern
+from psd_deflection.devices.contract_frames import candidate_ports, is_pattern
+from psd_deflection.devices.port import Address, OpenPort, has_baud, network_address
 from psd_deflection.devices.ports import open_port
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.devices.registry import make_source
@@ -464,9 +463,9 @@ def test_a_remote_serial_port_with_its_line_speed(remote: Remote) -> None:
 
 
 def test_more_than_can_be_read_ends_the_port(remote: Remote, monkeypatch: pytest.MonkeyPatch) -> None:
-    from psd_deflection.devices import rfc2217_port
+    from psd_deflection.devices import tcp_port
 
-    monkeypatch.setattr(rfc2217_port, 'MOST_WAITING', 100)
+    monkeypatch.setattr(tcp_port, 'MOST_WAITING', 100)
     port = open_port(remote.name, BAUD)
     remote.device.send(bytes(200))
     await_input(port, 200)
@@ -478,9 +477,9 @@ def test_more_than_can_be_read_ends_the_port(remote: Remote, monkeypatch: pytest
 def test_a_raw_port_is_not_taken_for_a_remote_serial_port(
     listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from psd_deflection.devices import rfc2217_port
+    from psd_deflection.devices import tcp_port
 
-    monkeypatch.setattr(rfc2217_port, 'OPEN_S', 0.2)
+    monkeypatch.setattr(tcp_port, 'OPEN_S', 0.2)
     port = listener.getsockname()[1]
     with pytest.raises(DeviceError, match=r'not as RFC 2217 says; is it a raw port \(socket://\)'):
         open_port(f'rfc2217://127.0.0.1:{port}', BAUD)

@@ -17,8 +17,8 @@ from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.replay import Pacer, Replay
 from psd_deflection.devices.source import Sample, SourceEndedError
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival, Ended
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Arrival, Ended
 from test.heard import WAIT_S
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'

@@ -26,8 +26,8 @@ from psd_deflection.devices.registry import make_source, source_names
 from psd_deflection.devices.source import Clock, PortClosedError, Received, Sample, Source, SourceEndedError
 from psd_deflection.records import CHANNELS
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Item
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Arrival, Ended, Item
 from test.heard import WAIT_S
 
 pytestmark = pytest.mark.slow
@@ -94,7 +94,7 @@ def acquisition_of(
 ) -> Acquisition:
     source = Scripted(load_rig())
     source.script, source.clock, source.numbered = script, clock, numbered
-    with patch('psd_deflection.run.reading.acquisition.make_source', lambda rig: source):
+    with patch('psd_deflection.run.acquisition.make_source', lambda rig: source):
         return Acquisition(load_rig(), null_log)
 
 
@@ -206,7 +206,7 @@ def test_a_device_that_goes_away_before_it_starts_is_waited_for(monkeypatch: pyt
 @pytest.mark.parametrize('gives_up', [True, False])
 def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gives_up: bool) -> None:
     """One that waits for its device is told to give up; one that hangs is left behind."""
-    monkeypatch.setattr('psd_deflection.run.reading.acquisition.GIVE_UP_TIMES', 1000 if gives_up else 1)
+    monkeypatch.setattr('psd_deflection.run.acquisition.GIVE_UP_TIMES', 1000 if gives_up else 1)
     waiting, over = threading.Event(), threading.Event()
 
     class Patient(Scripted):

@@ -14,8 +14,8 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.devices import survey as port_survey
 from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.ports import SerialPort
 from psd_deflection.devices.registry import known_devices
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.survey import serial_ports, survey
 from psd_deflection.rig.config import load_rig
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from psd_deflection.arms.compensation.shaping import SHAPING
+from psd_deflection.arms.compensation.settings import SHAPING
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig

@@ -15,8 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.measure.averaging import BlockCutter, block_middle_ns
-from psd_deflection.measure.measures import AT_ONCE, measured, of_one_length
+from psd_deflection.measure.averaging import AT_ONCE, BlockCutter, block_middle_ns, measured, of_one_length
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_start

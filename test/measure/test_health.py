@@ -10,7 +10,7 @@ import pytest
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.plate import Geometry
-from psd_deflection.model.solvers.one_psd import OnePsd
+from psd_deflection.model.solvers.subset import OnePsd
 from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, Record, SpotMeans, TipLoad
 from psd_deflection.rig.config import Rig, load_rig
 from test.measure.test_pipeline import STEP, chunk_of, still

@@ -23,9 +23,8 @@ import zstandard
 from msg_adapters import SAMPLES
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.mcap_format import MAGIC
+from psd_deflection.recordings.mcap_format import MAGIC, MAX_FIELDS, MAX_WARNINGS
 from psd_deflection.recordings.read import mcap_reader
-from psd_deflection.recordings.read.allowance import MAX_FIELDS, MAX_WARNINGS
 from psd_deflection.recordings.read.bag_reader import BagRecording
 from psd_deflection.recordings.read.clouds import CloudDecoder
 from psd_deflection.recordings.repair import recover

@@ -15,9 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.recordings.read import csv_rows
-from psd_deflection.recordings.read.csv_reader import CsvRecording
-from psd_deflection.recordings.read.csv_rows import SampleRows
+from psd_deflection.recordings.read import csv_reader
+from psd_deflection.recordings.read.csv_reader import CsvRecording, SampleRows
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
 from psd_deflection.records import (
@@ -374,7 +373,7 @@ def test_lines_in_pieces_and_lines_in_quotes_give_the_same(
         return ['t,x1,y1', *(odd.get(i, line) for i, line in enumerate(written))]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv_rows, '_PIECE', piece)
+        patch.setattr(csv_reader, '_PIECE', piece)
         at_once = reported(folder / 'a.csv', lines(''), ending, last)
     one_by_one = reported(folder / 'a.csv', lines('"'), ending, last)
     assert at_once == one_by_one

@@ -20,8 +20,7 @@ from psd_deflection.base.errors import PsdDeflectionError, RecordingError
 from psd_deflection.camera.footage import Footage
 from psd_deflection.model.simulation.loads import from_csv
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.read.readings_table import ReadingsTable
-from psd_deflection.recordings.read.references import read_references
+from psd_deflection.recordings.read.references import ReadingsTable, read_references
 
 NAMES = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 HEADER = ','.join(('t', *NAMES))

@@ -17,8 +17,7 @@ from mcap.records import Metadata as OracleMetadata
 from mcap.records import Schema as OracleSchema
 from mcap.writer import CompressionType, Writer
 
-from psd_deflection.recordings.mcap_format import RECORD_HEAD, Channel, Metadata, Opcode, Schema, parsed
-from psd_deflection.recordings.read.allowance import DamagedError
+from psd_deflection.recordings.mcap_format import RECORD_HEAD, Channel, DamagedError, Metadata, Opcode, Schema, parsed
 from psd_deflection.recordings.write.mcap_writer import McapWriter
 
 BAGS = sorted((Path(__file__).parent.parent.parent / 'bags').glob('*/*.mcap'))

@@ -59,7 +59,7 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 PATIENT = f"""
 import sys
 from psd_deflection.cli.main import main
-from psd_deflection.run.reading import acquisition
+from psd_deflection.run import acquisition
 acquisition.SILENCE_S = {WAIT_S}
 sys.exit(main())
 """

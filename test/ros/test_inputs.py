@@ -13,7 +13,7 @@ import pytest
 from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE, TOPICS
 from psd_deflection.records import AppliedLoad, BaseAcceleration, Mark, ReferencePose, TemperatureReading
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.ros.inputs import input_fault
+from psd_deflection.ros.sinks import input_fault
 
 NOW_NS = 1_700_000_000_000_000_000
 RECORDS: dict[str, Any] = {

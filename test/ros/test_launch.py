@@ -16,7 +16,7 @@ from typing import Any, List  # noqa: UP035, launch knows no list[str]
 import pytest
 
 from psd_deflection.arms.chains import chain_file
-from psd_deflection.arms.compensation import settings, shaping
+from psd_deflection.arms.compensation import settings
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import Parameter
 
@@ -113,7 +113,7 @@ def test_the_chain_is_launched_with_its_file(launched: Launched) -> None:
 @of('shaper')
 def test_arguments_reach_the_shaper(launched: Launched) -> None:
     assert launched.arguments == {'namespace', *launched.names['PARAMETERS'], *launched.names['TOPICS']}
-    launched.check_types(shaping.SHAPING.parameters)
+    launched.check_types(settings.SHAPING.parameters)
     node = launched.start()
     assert [(a, b.name) for a, b in node.remappings] == [('~/trajectory', 'given'), ('~/shaped', 'shaped')]
 

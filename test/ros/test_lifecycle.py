@@ -28,7 +28,7 @@ from visualization_msgs.msg import MarkerArray
 
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import null_log
-from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.ports import SerialPort
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros import estimator, node
 from psd_deflection.ros.running import OTHER_CHOICES, TRANSPORTS, ros

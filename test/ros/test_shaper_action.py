@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving
-from psd_deflection.ros.actions import GuardedServer
+from psd_deflection.ros.endpoints import GuardedServer
 from test.ros.conftest import WARNINGS, Peer
 from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program

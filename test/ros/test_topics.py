@@ -19,8 +19,8 @@ from tools.program import ROOT
 MAKERS = {
     'create_publisher': 'endpoints.py',
     'create_subscription': 'gate.py',
-    'ActionServer': 'actions.py',
-    'ActionClient': 'actions.py',
+    'ActionServer': 'endpoints.py',
+    'ActionClient': 'endpoints.py',
     'GuardedServer': 'gate.py',
     'GuardedClient': 'gate.py',
 }

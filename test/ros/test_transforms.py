@@ -21,13 +21,12 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log, texts
 from psd_deflection.records import BlockStatus, DeflectionEstimate, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.ros.description import robot_description
+from psd_deflection.ros.gate import robot_description
 from psd_deflection.ros.markers import at_rest, moving
 from psd_deflection.ros.running import ros
-from psd_deflection.ros.sinks import topics_of
-from psd_deflection.ros.transforms import TransformPublisher, static_transforms, tip_transform
+from psd_deflection.ros.sinks import TransformPublisher, static_transforms, tip_transform, topics_of
 from psd_deflection.run.processing import RecordSink
-from psd_deflection.run.signals import Signals, StopRequestedError
+from psd_deflection.run.realtime import Signals, StopRequestedError
 
 pytestmark = pytest.mark.ros
 

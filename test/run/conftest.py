@@ -24,7 +24,7 @@ from psd_deflection.devices.protocol.frames import (
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.records import CHANNELS, DeflectionEstimate, Record
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run.reading import acquisition
+from psd_deflection.run import acquisition
 from test.heard import WAIT_S
 
 HELLO = HelloFrame(

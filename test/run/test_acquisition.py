@@ -19,14 +19,14 @@ from hypothesis import strategies as st
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import INFO, WARNING, null_log, texts
 from psd_deflection.devices import contract_frames, port_source
+from psd_deflection.devices.ports import SerialPort
 from psd_deflection.devices.protocol.frames import HelloFrame, PongFrame, SampleFrame, encode
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, RESTART
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run.reading import acquisition as module
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Annotation, Arrival, Ended, Item, Restarted
+from psd_deflection.run import acquisition as module
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Annotation, Arrival, Ended, Item, Restarted
 from test.heard import WAIT_S
 
 pytestmark = pytest.mark.slow

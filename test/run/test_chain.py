@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.arms.chains.chain import Chain, EndEffector
+from psd_deflection.arms.chains.chain import PATIENCE, Chain, EndEffector
 from psd_deflection.arms.chains.chain_file import ChainFile, read_chain
-from psd_deflection.arms.chains.joining import PATIENCE
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import null_log, texts
 from psd_deflection.devices.protocol.frames import SampleFrame

@@ -9,7 +9,7 @@ import pytest
 
 from psd_deflection.devices.protocol.frames import BadFrame, SampleFrame
 from psd_deflection.devices.source import Sample
-from psd_deflection.run.reading.clock_watch import ClockWatch
+from psd_deflection.run.clock_watch import ClockWatch
 
 COUNTS = (0, 0, 16384, 0, 0, 16384)
 MS = 1_000_000

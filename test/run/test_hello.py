@@ -31,11 +31,11 @@ from psd_deflection.devices.source import Event, Received, Source, SourceEndedEr
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import CHANNELS, channel_names
 from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run import acquisition as module
 from psd_deflection.run import processing
-from psd_deflection.run.reading import acquisition as module
-from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival
-from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
+from psd_deflection.run.acquisition import Acquisition
+from psd_deflection.run.arrivals import Arrival
+from psd_deflection.run.hello import AnotherDeviceError, HelloGate
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice

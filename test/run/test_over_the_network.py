@@ -17,8 +17,7 @@ import pytest
 from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, HelloRequestFrame, PingFrame, encode
 from psd_deflection.devices.rig_feed import RigFeed
-from psd_deflection.devices.serve import serve
-from psd_deflection.devices.served_sockets import open_sockets
+from psd_deflection.devices.serve import open_sockets, serve
 from psd_deflection.rig.config import Rig, load_rig
 from test.heard import WAIT_S
 from test.run.conftest import HELLO, ScriptedDevice

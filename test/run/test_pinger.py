@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 
 from psd_deflection.devices.source import PortClosedError, Source
-from psd_deflection.run.reading.pinger import PING_S, UNANSWERED, Pinger
+from psd_deflection.run.hello import PING_S, UNANSWERED, Pinger
 
 pytestmark = pytest.mark.slow
 

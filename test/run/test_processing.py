@@ -17,8 +17,8 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk, Record
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run import processing as module
+from psd_deflection.run.arrivals import Arrival, Ended, ItemQueue
 from psd_deflection.run.processing import Processing
-from psd_deflection.run.reading.arrivals import Arrival, Ended, ItemQueue
 from test.heard import WAIT_S
 
 MS = 1_000_000

@@ -28,12 +28,12 @@ from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import Record
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.run import lag, recorder
+from psd_deflection.run import realtime, recorder
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.headless import run_headless, run_until_signal
 from psd_deflection.run.monitor.start import start_views
+from psd_deflection.run.realtime import Signals, StopRequestedError
 from psd_deflection.run.session import Session
-from psd_deflection.run.signals import Signals, StopRequestedError
 from test.altered import altered
 from test.heard import WAIT_S, until
 
@@ -197,7 +197,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
 def test_samples_behind_part_that_hangs_are_counted(
     device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lag, 'HELD_S', 0.0)
+    monkeypatch.setattr(realtime, 'HELD_S', 0.0)
     logged: list[str] = []
     session, held = run_of(rig, tmp_path, logged)
     device.send_frames(*(sample(seq) for seq in range(20)))
@@ -238,7 +238,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
     device: Any, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     device.answer = b''
-    monkeypatch.setattr('psd_deflection.run.reading.acquisition.SILENCE_S', 60.0)
+    monkeypatch.setattr('psd_deflection.run.acquisition.SILENCE_S', 60.0)
     # Under nohup the tests themselves are started with SIGHUP ignored.
     before = signal.signal(number, signal.SIG_DFL)
 

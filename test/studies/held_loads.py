@@ -18,7 +18,7 @@ from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.result import Checkup
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 
 RIG = load_rig()
 LEVELS = np.array(

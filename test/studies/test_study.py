@@ -22,12 +22,11 @@ from psd_deflection.measure.watch import Alarm
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 from psd_deflection.records import Mark
 from psd_deflection.studies.budget.certificate import CertificateProblem, certify
-from psd_deflection.studies.budget.certificate_page import Certified
-from psd_deflection.studies.budget.from_calibration import read_calibration
+from psd_deflection.studies.budget.certificate_page import Certified, read_calibration
 from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, read_inputs
 from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LoopResult
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 from psd_deflection.studies.watch.result import WatchedRun
 from test.studies.discover.test_laws import Spring

@@ -34,7 +34,7 @@ from psd_deflection.arms.chains.chain import SLOPES, Chain, ChainLink
 from psd_deflection.arms.chains.transform import Transform, of_position_and_angles
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import tree_of_file
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import FRAME_PREFIX

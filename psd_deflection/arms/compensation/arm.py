@@ -20,8 +20,7 @@ import numpy as np
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_position_and_angles, turn
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import text_of_file
-from psd_deflection.base.numbers import plain_number
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean, plain_number
 from psd_deflection.records import FloatArray
 
 NO_TIP = 'tip: the link of the end effector must be named'

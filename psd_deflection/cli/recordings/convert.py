@@ -22,7 +22,7 @@ from psd_deflection.cli._options import namespace_option, recording_name, span_o
 from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.conversion import Beside, convert, convert_computed
-from psd_deflection.recordings.formats.registry import format_of_name
+from psd_deflection.recordings.formats.format import format_of_name
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import open_for_replay, warnings_about_rig

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 from psd_deflection.cli._fleet import (
     ERROR,
     executor_option,
@@ -37,7 +37,7 @@ from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.provenance import NAMES
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.read.readings_table import described, is_table
+from psd_deflection.recordings.read.references import described, is_table
 from psd_deflection.recordings.recording import EPOCH_FROM_NS
 from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.summary import summary

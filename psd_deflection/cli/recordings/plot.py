@@ -24,13 +24,13 @@ import numpy as np
 
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import RecordingError, UsageError
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name, span_options
 from psd_deflection.cli._plot_page import DrawnInputs, plot_page
 from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.recordings.formats.registry import endings_of_recordings
+from psd_deflection.recordings.formats.format import endings_of_recordings
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
 from psd_deflection.recordings.spans import FULL, span_ns

@@ -50,12 +50,12 @@ from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.replay.comparison import ReplayComparison
 from psd_deflection.recordings.replay.engine import (
     BufferedEstimates,
+    WatchedReplay,
     open_for_replay,
     part_of,
     replayed,
     warnings_about_rig,
 )
-from psd_deflection.recordings.replay.watched import WatchedReplay
 from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans

@@ -30,10 +30,9 @@ from psd_deflection.base.axes import SHOWN, SHOWN_UNITS
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.files import creating
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import need_folder
+from psd_deflection.cli._options import need_folder, require_ros
 from psd_deflection.cli._report import print_json
 from psd_deflection.cli._values import integer
-from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.rig.parameters import Value
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.headless import run_until_signal

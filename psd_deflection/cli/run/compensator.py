@@ -24,8 +24,7 @@ from psd_deflection.arms.compensation.arm import NO_TIP, read_arm
 from psd_deflection.arms.compensation.settings import SETTINGS
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import of_options, section_options
-from psd_deflection.cli.run._ros import require_ros
+from psd_deflection.cli._options import of_options, require_ros, section_options
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -24,9 +24,8 @@ from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import DEMO, given_parameters, over_file, parameter_option, reject_demo
+from psd_deflection.cli._options import DEMO, given_parameters, over_file, parameter_option, reject_demo, require_ros
 from psd_deflection.cli._values import given_as_option
-from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.model.solvers.registry import SOLVERS, check_live
 from psd_deflection.run.headless import run_headless

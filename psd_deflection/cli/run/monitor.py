@@ -27,7 +27,7 @@ from collections.abc import Iterator
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import INFO
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import (
     DEMO,

@@ -19,10 +19,9 @@ from __future__ import annotations
 
 import argparse
 
-from psd_deflection.arms.compensation.shaping import SHAPING, trajectory_shaper
+from psd_deflection.arms.compensation.settings import SHAPING, trajectory_shaper
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import of_options, section_options
-from psd_deflection.cli.run._ros import require_ros
+from psd_deflection.cli._options import of_options, require_ros, section_options
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

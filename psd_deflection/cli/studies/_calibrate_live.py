@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psd_deflection.base.errors import DaemonError, RecordingError
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 from psd_deflection.cli._daemon import daemon_of
 from psd_deflection.cli._report import LONGEST_LINE, print_json, show, warn
 from psd_deflection.run.bench_calibration import BenchStep, follow
 from psd_deflection.run.monitor.served import need_server
-from psd_deflection.run.signals import Signals
+from psd_deflection.run.realtime import Signals
 from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
 from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress
 from psd_deflection.studies.calibrate.result import Calibrated

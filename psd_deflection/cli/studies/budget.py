@@ -25,20 +25,19 @@ from tqdm import tqdm
 
 from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 from psd_deflection.cli._options import PICTURES, make_writable, need_folder, picture_or_folder, reject
 from psd_deflection.cli._report import save_figure, show, show_text
 from psd_deflection.cli._values import given_as_option, integer, need_finite, seed
 from psd_deflection.cli.studies._answer import answer, print_answer
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.studies.budget import optics
+from psd_deflection.studies.budget import sensor
 from psd_deflection.studies.budget.budget import BudgetProblem, budget
-from psd_deflection.studies.budget.computation import stop_window
-from psd_deflection.studies.budget.environment import averaging_gain
-from psd_deflection.studies.budget.estimate import METHODS
-from psd_deflection.studies.budget.evaluate import CAUSES
+from psd_deflection.studies.budget.chain import METHODS
+from psd_deflection.studies.budget.evaluate import CAUSES, stop_window
 from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
+from psd_deflection.studies.budget.installation import averaging_gain
 
 MAX_DRAWS = 10_000_000
 
@@ -144,12 +143,12 @@ def explain(rig: Rig, inputs: dict[str, float]) -> str:
 def _derived(rig: Rig, inputs: dict[str, float]) -> list[str]:
     """Intermediate results of chapter 3 at these inputs."""
     length, temperature, wavelength = rig.link.length, inputs['temperature'], inputs['laser_wavelength']
-    spot = optics.beam_diameter(inputs['laser_diameter'], wavelength, length)
-    index = optics.air_index(optics.STANDARD_PRESSURE, temperature, wavelength=wavelength)
-    per_kelvin = optics.index_per_kelvin(temperature, wavelength)
-    per_gradient = optics.gradient_shift(abs(per_kelvin), length)
-    warm = optics.air_index(optics.STANDARD_PRESSURE, temperature + inputs['air_step'], wavelength=wavelength)
-    step = optics.boundary_shift(inputs['air_step_angle'], index, warm, length)
+    spot = sensor.beam_diameter(inputs['laser_diameter'], wavelength, length)
+    index = sensor.air_index(sensor.STANDARD_PRESSURE, temperature, wavelength=wavelength)
+    per_kelvin = sensor.index_per_kelvin(temperature, wavelength)
+    per_gradient = sensor.gradient_shift(abs(per_kelvin), length)
+    warm = sensor.air_index(sensor.STANDARD_PRESSURE, temperature + inputs['air_step'], wavelength=wavelength)
+    step = sensor.boundary_shift(inputs['air_step_angle'], index, warm, length)
     rate, block = rig.converter.sample_rate_hz, rig.estimator.block_size
     hum = averaging_gain(block, inputs['interference_frequency'], rate)
     noise = rig.noises[:, :2] * rig.sensitivities

@@ -21,14 +21,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 from psd_deflection.cli._options import make_writable
 from psd_deflection.cli._values import given_as_option, need_finite
 from psd_deflection.cli.studies._answer import answer
 from psd_deflection.cli.studies.budget import settings_of
 from psd_deflection.studies.budget.certificate import CertificateProblem, certify
-from psd_deflection.studies.budget.certificate_page import Certified
-from psd_deflection.studies.budget.from_calibration import read_calibration, read_fields
+from psd_deflection.studies.budget.certificate_page import Certified, read_calibration, read_fields
 from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, read_inputs
 
 DECLARED = (*INPUTS, *REFERENCE_INPUTS)

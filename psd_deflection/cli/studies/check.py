@@ -26,7 +26,7 @@ import sys
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 from psd_deflection.cli._options import (
     given_parameters,
     in_the_world,

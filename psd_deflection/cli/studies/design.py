@@ -26,8 +26,8 @@ import numpy as np
 
 from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
-from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.tables import columns
+from psd_deflection.base.text import plain_number
 from psd_deflection.cli._options import PICTURES, need_folder, picture_name, reject
 from psd_deflection.cli._report import print_json, save_figure, show, show_text
 from psd_deflection.cli._values import given_as_option
@@ -38,7 +38,7 @@ from psd_deflection.model.plate.linear import condition_number, design_matrix
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig
 from psd_deflection.studies import splitter
-from psd_deflection.studies.budget.load import default_load
+from psd_deflection.studies.budget.budget import default_load
 from psd_deflection.studies.thesis import scaling
 
 TILTED = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])

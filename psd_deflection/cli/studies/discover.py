@@ -36,6 +36,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -45,7 +47,7 @@ from typing import Any
 from tqdm import tqdm
 
 from psd_deflection.base.errors import ConfigError, UsageError
-from psd_deflection.cli import _next
+from psd_deflection.base.text import plain_number
 from psd_deflection.cli._fleet import (
     ERROR,
     TaskResult,
@@ -55,24 +57,161 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, reject, span_options
+from psd_deflection.cli._options import (
+    in_the_world,
+    make_writable,
+    namespace_option,
+    reject,
+    span_options,
+    world_option,
+)
 from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import save_all, show, warn
-from psd_deflection.cli._values import given_as_option, seed
+from psd_deflection.cli._values import given_as_option, integer, seed
 from psd_deflection.cli.studies._answer import print_answer
-from psd_deflection.model.simulation.catalogue import effect_folders, effect_names
-from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.model.simulation.catalogue import effect_folders, effect_names, with_effects
+from psd_deflection.model.simulation.loads import load_history
+from psd_deflection.recordings.replay.simulated_recording import SimulatedRun
 from psd_deflection.recordings.spans import FULL
-from psd_deflection.rig.config import load_rig
+from psd_deflection.recordings.write.sinks import open_sink
+from psd_deflection.records import AppliedLoad, Record, TemperatureReading
+from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.discover.conclusion import adopting_folder
 from psd_deflection.studies.discover.experiment import Limits
-from psd_deflection.studies.discover.from_recordings import DiscoverOptions
+from psd_deflection.studies.discover.from_recordings import DiscoverOptions, read_observation
 from psd_deflection.studies.discover.isolable import isolable
-from psd_deflection.studies.discover.loop import LoopResult, planned, run_loop
+from psd_deflection.studies.discover.loop import LISTED, SCRIPT, LoopResult, planned, recorded_name, run_loop
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.planning import Plan
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
+
+_NEXT_HELP = """\
+limits of --next (--limit NAME=VALUE), with what holds if they are not given:
+  force=50         largest force, N
+  torque=29.25     largest torque, N m; 0 if there is none but by the sidebar
+  sidebar=0.585    farthest place of a weight from the link, m; 0 for none
+  sideways=yes     whether forces may pull along X and up; no: weights only
+  sweep=150        highest frequency of an exciter, Hz; 0 for none
+  swing=10         how far the temperature can be raised and lowered, K
+  lengths=...      links that can be mounted, m, such as 0.4,0.5 (default: 0.7
+                   of the rig's; none: lengths=)
+  rates=           further sample rates, Hz, such as 2000
+  seconds=60       longest recording
+"""
+_BOUNDS = {
+    'force': (0.0, 1e5),
+    'torque': (0.0, 1e5),
+    'sidebar': (0.0, 100.0),
+    'sweep': (0.0, 1e5),
+    'swing': (0.0, 100.0),
+    'seconds': (5.0, 600.0),
+}
+_LISTS = {'lengths': (0.01, 100.0), 'rates': (10.0, 1e5)}
+
+
+def _next_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    group = parser.add_argument_group('the next recording')
+    group.add_argument('--next', action='store_true', help='plan the recording that best tells apart what is left')
+    group.add_argument(
+        '--limit', metavar='NAME=VALUE', action='append', default=[], help='what the rig can do, see below; repeatable'
+    )
+    group.add_argument(
+        '--run',
+        # ``run`` is the command itself.
+        dest='make_it',
+        action='store_true',
+        help='make the planned recordings on the simulated rig, until the answer is unique or no recording would help',
+    )
+    group.add_argument(
+        '--at-most',
+        type=integer('--at-most', 1, 20),
+        default=3,
+        metavar='N',
+        help='recordings that --run makes (default 3)',
+    )
+    group.add_argument(
+        '--effect', metavar='NAME,KEY=VALUE,...', action='append', default=[], help='of the simulated rig; repeatable'
+    )
+    world_option(group)
+
+
+def _limits_of(args: argparse.Namespace) -> Limits:
+    """The limits of --limit. Raises UsageError for options that do not belong together."""
+    if args.make_it and not args.next:
+        raise UsageError('--run is for --next')
+    if not args.next:
+        reject(args, {'limit': []}, 'is for --next')
+    if not args.make_it:
+        reject(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
+    return limits_from_words(args.limit)
+
+
+def limits_from_words(words: Sequence[str]) -> Limits:
+    """The limits of ``--limit``. Raises UsageError naming the word and its bounds."""
+    given: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition('=')
+        names = [f.name for f in dataclasses.fields(Limits)]
+        if not equals or name not in names:
+            raise UsageError(f'--limit {word}: must be NAME=VALUE with one of {", ".join(names)}')
+        if name == 'sideways':
+            if text not in ('yes', 'no'):
+                raise UsageError(f'--limit {word}: must be yes or no')
+            given[name] = text == 'yes'
+            continue
+        low, high = {**_BOUNDS, **_LISTS}[name]
+        try:
+            values = tuple(plain_number(t) for t in text.split(',')) if text else ()
+        except ValueError:
+            values = (float('nan'),)
+        if not all(low <= v <= high for v in values) or (name in _BOUNDS and len(values) != 1):
+            kind = 'numbers' if name in _LISTS else 'a number'
+            raise UsageError(f'--limit {word}: must be {kind} of at least {low:g} and at most {high:g}')
+        given[name] = values if name in _LISTS else values[0]
+    return dataclasses.replace(Limits(), **given)
+
+
+def how_to_record(plan: Plan, out: Path) -> list[str]:
+    """What to type to make a planned recording, whose loads are in the folder ``out``."""
+    words = ['psd-deflection', 'simulate', '--out', str(out / 'next.csv'), '--loads', str(out / SCRIPT)]
+    if plan.setting.swing:
+        words += ['--temperature', ','.join(f'{k:g}' for k in plan.setting.knots)]
+    for name, value in plan.setting.changes.items():
+        words += ['--world', f'{name}={value}']
+    return [
+        f'load script: {out / SCRIPT}; save the recording as {out / "next.csv"}; on the simulated rig:',
+        f'  {shlex.join(words)}',
+        f'then search again in the recordings so far and {out / LISTED}',
+    ]
+
+
+def _recorder(args: argparse.Namespace, rig: Rig, out: Path) -> Callable[[Plan, int], Observation]:
+    """Makes a planned recording on the simulated rig: ``rig`` with what --effect and --world say.
+
+    Raises UsageError for a bad option, before anything is recorded.
+    """
+    with given_as_option():
+        with_effects(in_the_world(rig, args.world), args.effect, '--effect')
+
+    def record(plan: Plan, number: int) -> Observation:
+        known = replace_values(rig, plan.setting.changes) if plan.setting.changes else rig
+        true = with_effects(in_the_world(known, args.world), args.effect, '--effect')
+        loads = plan.loads
+        warm = plan.setting.temperature(len(loads))
+        kinds: list[type[Record]] = [AppliedLoad]
+        kinds += [TemperatureReading] * (warm is not None)
+        path = out / recorded_name(number)
+        run = SimulatedRun(true, known, loads, warm, args.seed + number)
+        with contextlib.closing(open_sink(path, known.flat(), samples_with=kinds, psds=len(known.psds))) as sink:
+            for each in run.records(0):
+                sink.put(each)
+        return read_observation(path, known)
+
+    return record
+
 
 STEPS = 8
 """Steps that the progress bar counts: described, signatures, adding, weighing, alternatives, where, report, done.
@@ -124,8 +263,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME',
         help='if a law is found, write it as the effect NAME to the folder of your effects and into model.yaml',
     )
-    _next.add_arguments(parser)
-    parser.epilog = _next.HELP
+    _next_arguments(parser)
+    parser.epilog = _NEXT_HELP
     span_options(parser)
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
@@ -143,7 +282,7 @@ def run(args: argparse.Namespace) -> int:
     if names is not None:
         reject(args, {'next': False}, 'is not for --each')
         return _each(args, names, asked)
-    limits = _next.limits(args)
+    limits = _limits_of(args)
     if args.adopt is not None:
         try:
             adopting_folder(args.adopt)
@@ -228,7 +367,7 @@ def _searched(
 ) -> Discovery | LoopResult:
     search = partial(asked.discovered, progress=progress, notify=warn)
     if args.make_it:
-        record = _next.simulated(args, asked.rig() or observations[0].rig, Path(args.out))
+        record = _recorder(args, asked.rig() or observations[0].rig, Path(args.out))
         return run_loop(observations, search, record, limits=limits, most=args.at_most, progress=progress)
     found = search(observations)
     progress('planning')
@@ -254,7 +393,7 @@ def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str
         hints.append(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
     if isinstance(answer, LoopResult):
         if answer.outcome is None and answer.open is not None and answer.open.useful:
-            hints += _next.how(answer.open, out)
+            hints += how_to_record(answer.open, out)
     elif found.unsettled:
         hints.append('next: psd-deflection discover with these recordings and --next plans the recording that tells')
     if found.effects and found.verdict == 'effects_found' and not (found.unsettled and not args.next):

@@ -16,8 +16,8 @@ import argparse
 from typing import Any
 
 from psd_deflection.base.errors import UsageError
-from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.base.tables import columns
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import STAGES, Effect, EffectParameter

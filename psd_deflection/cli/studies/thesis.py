@@ -32,6 +32,7 @@ from psd_deflection.model.plate import Geometry
 from psd_deflection.model.plate.linear import condition_number, design_matrix, error_bound
 from psd_deflection.model.solvers import make_solver
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.thesis.appendix_d import compared, mismatch
 from psd_deflection.studies.thesis.comparison import (
     CAUSES,
     CONDITIONS,
@@ -47,11 +48,10 @@ from psd_deflection.studies.thesis.comparison import (
     methods,
     printed_bound,
     rejected,
+    spot_changes,
     table_5_1,
     thesis_geometry,
 )
-from psd_deflection.studies.thesis.large_spots import spot_changes
-from psd_deflection.studies.thesis.tilt_compensation import compared, mismatch
 
 _UNITS = (1e6, 1e6, MDEG)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 
 MAX_TEXT = 200
 """Characters of one text. A longer one is cut."""

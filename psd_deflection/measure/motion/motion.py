@@ -24,10 +24,8 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.motion.inertia import Forced, Inertia
-from psd_deflection.measure.motion.innovations import Innovations
-from psd_deflection.measure.motion.known import KnownLoads, Pushed, joined_ns, split_ns
-from psd_deflection.measure.motion.modal import BlockTables, Oscillator
-from psd_deflection.measure.motion.unseen import UnseenLoads
+from psd_deflection.measure.motion.modal import BlockTables, KnownLoads, Oscillator, Pushed, joined_ns, split_ns
+from psd_deflection.measure.motion.unseen import Innovations, UnseenLoads
 from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, inverse
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray

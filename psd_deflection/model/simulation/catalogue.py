@@ -30,14 +30,16 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.plugins import loaded
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.model.simulation import effects as ours
 from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
-from psd_deflection.rig.config import Rig
-from psd_deflection.rig.parameter_files import EFFECTS_PREFIX
+from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, flattened
+from psd_deflection.rig.parameters import shown
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
 
 LAW = 'law'
 """Key of the text of a law, among the parameters of an effect."""
@@ -301,3 +303,43 @@ def effects_to_values(effects: Sequence[ActiveEffect]) -> dict[str, dict[str, ob
             body[LAW] = active.effect.law
         out[key] = body
     return out
+
+
+def with_effects(rig: Rig, words: Sequence[str], source: str) -> Rig:
+    """``rig`` with the effects of ``words``, all checked. Raises ConfigError naming ``source``."""
+    changes: dict[str, object] = {}
+    for i, text in enumerate(words):
+        name, *pairs = text.split(',')
+        changes[f'{EFFECTS_PREFIX}effect_{i}.name'] = name
+        for pair in pairs:
+            key, equals, value = pair.partition('=')
+            if not equals:
+                raise ConfigError(f'{source} {text}: {pair!r} is not KEY=VALUE')
+            changes[f'{EFFECTS_PREFIX}effect_{i}.{key}'] = value
+    changed = replace_values(rig, changes, source) if changes else rig
+    effects_of_rig(changed)
+    return changed
+
+
+def with_effects_of(rig: Rig, effects: str | Sequence[str] | Mapping[str, object], source: str) -> Rig:
+    """``rig`` with ``effects``: words of the command line, or a map like that below ``effects:`` of a rig file.
+
+    Raises ConfigError naming ``source``.
+    """
+    if isinstance(effects, str):
+        effects = [effects]
+    if isinstance(effects, Mapping):
+        taken = {key.partition('.')[0] for key in rig.effects}
+        tree = {
+            # An effect of the rig file stays beside a hidden one of its name.
+            f'hidden_{key}' if key in taken else key: {'name': key, **body} if isinstance(body, Mapping) else body
+            for key, body in effects.items()
+        }
+        changed = replace_values(rig, flattened({EFFECTS_PREFIX.rstrip('.'): tree}, source), source)
+        effects_of_rig(changed)
+        return changed
+    if not isinstance(effects, Sequence) or not all(isinstance(text, str) for text in effects):
+        raise ConfigError(
+            f"{source} = {shown(effects)}: must be ['NAME,KEY=VALUE,...'] or a map {{NAME: {{KEY: VALUE}}}}"
+        )
+    return with_effects(rig, effects, source)

@@ -13,7 +13,7 @@ from typing import cast
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import tree_of_file, tree_of_text
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.model.simulation.declaration import STAGES, Stage
 from psd_deflection.model.simulation.laws import ANY, DOTS, FORMS, SUMS, TARGETS, Law, LawTerm
 from psd_deflection.rig.parameters import Parameter, check_value

@@ -21,8 +21,7 @@ import numpy.typing as npt
 from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, State
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
-from psd_deflection.model.simulation.optics import dots_on_plate
-from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.physics import Physics, dots_on_plate
 from psd_deflection.model.simulation.samples import SimulatedSamples, no_samples_between
 from psd_deflection.model.solvers.registry import check_arrangement
 from psd_deflection.records import FloatArray

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from psd_deflection.base.errors import ConfigError, SolverError
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.base.text import did_you_mean
 from psd_deflection.model.plate.layout import Geometry
 from psd_deflection.model.solvers.interface import Solver
 from psd_deflection.rig.config import BASE_SOLVER, Rig
@@ -39,12 +39,10 @@ SOLVERS: MappingProxyType[str, Entry] = MappingProxyType(
         'minimum_tilt': Entry('psd_deflection.model.solvers.minimum_tilt:MinimumTiltSolver'),
         'pose': Entry('psd_deflection.model.solvers.pose:PoseSolver'),
         'base_pair': Entry('psd_deflection.model.solvers.base_pair:BasePairSolver'),
-        'iterative_printed': Entry(
-            'psd_deflection.studies.thesis.iterative_printed:IterativePrintedSolver', 'iterative'
-        ),
+        'iterative_printed': Entry('psd_deflection.studies.thesis.appendix_d:IterativePrintedSolver', 'iterative'),
         'appendix_d': Entry('psd_deflection.studies.thesis.appendix_d:AppendixDSolver', 'iterative'),
-        'appendix_d_ols': Entry('psd_deflection.studies.thesis.appendix_d_least_squares:AppendixDOlsSolver', 'ols'),
-        'appendix_d_wls': Entry('psd_deflection.studies.thesis.appendix_d_least_squares:AppendixDWlsSolver', 'wls'),
+        'appendix_d_ols': Entry('psd_deflection.studies.thesis.appendix_d:AppendixDOlsSolver', 'ols'),
+        'appendix_d_wls': Entry('psd_deflection.studies.thesis.appendix_d:AppendixDWlsSolver', 'wls'),
     }
 )
 """The default first."""

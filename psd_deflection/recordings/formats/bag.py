@@ -8,8 +8,7 @@ from pathlib import Path
 
 from psd_deflection.recordings.formats.format import Format, ReadOptions, Sink, WriteOptions
 from psd_deflection.recordings.read.bag_reader import BagRecording
-from psd_deflection.recordings.write.bag_writer import BagWriter
-from psd_deflection.recordings.write.reference_sink import ReferenceSink
+from psd_deflection.recordings.write.bag_writer import BagWriter, ReferenceSink
 
 
 def _read(path: Path, options: ReadOptions) -> BagRecording:

@@ -9,8 +9,7 @@ from pathlib import Path
 from psd_deflection.recordings.formats.format import Format, ReadOptions, Sink, WriteOptions
 from psd_deflection.recordings.mcap_format import MAGIC
 from psd_deflection.recordings.read.bag_reader import BagRecording
-from psd_deflection.recordings.write.bag_writer import McapFile
-from psd_deflection.recordings.write.reference_sink import ReferenceSink
+from psd_deflection.recordings.write.bag_writer import McapFile, ReferenceSink
 
 
 def _read(path: Path, options: ReadOptions) -> BagRecording:

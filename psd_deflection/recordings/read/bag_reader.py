@@ -45,7 +45,7 @@ from psd_deflection.base.sequence import RecordedSequence
 from psd_deflection.measure.state import FULL
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.read.allowance import Warnings
+from psd_deflection.recordings.mcap_format import Warnings
 from psd_deflection.recordings.read.clouds import CloudDecoder, joined_points
 from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import Recording

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from msg_adapters import point_cloud2
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.read.allowance import MAX_FIELDS
+from psd_deflection.recordings.mcap_format import MAX_FIELDS
 from psd_deflection.records import IntArray, channel_names
 
 

@@ -3,7 +3,7 @@
 """Reads one MCAP file from front to back, even if it is cut or damaged.
 
 If a file lost its end, or a chunk is damaged, everything else is read, with a warning. Every size that a file
-declares is compared with the file's own size or with the :mod:`~psd_deflection.recordings.read.allowance` before
+declares is compared with the file's own size or with the :mod:`~psd_deflection.recordings.mcap_format` before
 it is used.
 The format: https://mcap.dev/spec.
 """
@@ -20,17 +20,21 @@ from typing import BinaryIO, NamedTuple
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.mcap_format import (
     MAGIC,
+    MAX_CHUNK_BYTES,
     MESSAGE_HEAD,
     RECORD_HEAD,
+    Allowance,
     Channel,
+    DamagedError,
     McapRecord,
     Metadata,
     Opcode,
     Schema,
+    SpentError,
+    Warnings,
     parsed,
     parsed_chunk,
 )
-from psd_deflection.recordings.read.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, SpentError, Warnings
 
 _INDEX_HEAD = struct.Struct('<BQH')
 """Head of a record and the channel that an index of messages is of."""

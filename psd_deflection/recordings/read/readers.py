@@ -10,9 +10,8 @@ from pathlib import Path
 from psd_deflection.base.csv_table import head_of
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.foreign_tables import what_of_file
-from psd_deflection.base.spelling import did_you_mean
-from psd_deflection.recordings.formats.format import ReadOptions
-from psd_deflection.recordings.formats.registry import format_of_content, formats
+from psd_deflection.base.text import did_you_mean
+from psd_deflection.recordings.formats.format import ReadOptions, format_of_content, formats
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.spans import FULL, Span
 

@@ -38,7 +38,7 @@ from psd_deflection.recordings.write.bag_metadata import (
     write_metadata,
 )
 from psd_deflection.recordings.write.mcap_writer import McapWriter
-from psd_deflection.records import ParameterChange, Record, RigState
+from psd_deflection.records import ParameterChange, Record, ReferencePose, ReferenceWithCovariance, RigState
 from psd_deflection.rig.declarations import FRAME_PREFIX
 
 CHUNK_NS = 500_000_000
@@ -423,3 +423,20 @@ class BagWriter(_RecordSink):
         self._held.close()
         if ours:
             self.folder.rmdir()
+
+
+class ReferenceSink:
+    """Poses into ``file``, which it closes. Raises RecordingError if the disk cannot be written."""
+
+    def __init__(self, file: McapFile | BagWriter) -> None:
+        self._file = file
+
+    def put(self, t_ns: int, reference: ReferenceWithCovariance | None, status: str) -> None:
+        """Write the pose of one frame; a frame without one has no message."""
+        if reference is not None:
+            self._file.put(ReferencePose(t_ns, reference.dx, reference.dy, reference.theta))
+            self._file.put(reference)
+
+    def close(self) -> None:
+        """Write index and summary and close."""
+        self._file.close()

@@ -19,7 +19,7 @@ import numpy as np
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import creating
-from psd_deflection.model.plate.scene import bend, tip_boxes
+from psd_deflection.model.plate.layout import bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, Record, SpotMeans, TipLoad
 from psd_deflection.rig.config import Rig
 

@@ -8,8 +8,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.recordings.formats.format import ReferenceFile, Sink, WriteOptions
-from psd_deflection.recordings.formats.registry import format_of_name
+from psd_deflection.recordings.formats.format import ReferenceFile, Sink, WriteOptions, format_of_name
 from psd_deflection.records import Record
 
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A web server in a thread of its own, with the gate that every view of the daemon has.
-
-A request must name this machine, and one that opens a websocket, asks for data or changes something must come from a
-page that may (:mod:`.access`). The number of viewers and of connections is bounded; a viewer that does not read is
-dropped after ``HEARTBEAT_S``; nothing waits for one. The end takes less than a second. A bad request gets an error
-response, never a traceback in the log.
-"""
+"""A web server in a thread of its own, with the gate that every view of the daemon has: who may see it, who may press
+its buttons. It takes bounded numbers of viewers and connections, and waits for none."""
 
 from __future__ import annotations
 
@@ -14,10 +9,13 @@ import abc
 import asyncio
 import contextlib
 import errno
+import hmac
+import ipaddress
 import logging
+import re
 import socket
 import threading
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -25,7 +23,65 @@ from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import ERROR, WARNING, LogCallback
-from psd_deflection.run.monitor import access
+
+_HOST = re.compile(r'(?:\[([0-9a-f:.]+(?:%[a-z0-9._-]+)?)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?')
+
+
+def host_name(host_header: str) -> str:
+    """The name in a Host header, without port and brackets, lower case; '' if it is malformed."""
+    found = _HOST.fullmatch(host_header.lower())
+    return (found[1] or found[2]).rstrip('.') if found is not None else ''
+
+
+def is_address(name: str) -> bool:
+    """Whether ``name`` is an IP address, which no name server can redirect."""
+    try:
+        ipaddress.ip_address(name.partition('%')[0])
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this machine can reach a server bound to ``address``."""
+    if address == 'localhost':
+        return True
+    return is_address(address) and ipaddress.ip_address(address.partition('%')[0]).is_loopback
+
+
+def is_own_host(host_header: str, address: str) -> bool:
+    """Whether the Host header names this machine: an address, localhost, or its host name.
+
+    Any web page can make a browser send requests, also to 127.0.0.1. So a request must name this
+    machine as its host: otherwise a foreign name could point here (DNS rebinding). A request that
+    comes from a page must come from our page: otherwise any site could take the zero (cross-site request
+    forgery, cross-site websocket hijacking). If others on the network can reach the page, its
+    buttons also need a token.
+    """
+    name = host_name(host_header)
+    if not name:
+        return False
+    if is_loopback(address):
+        return is_loopback(name)
+    own = socket.gethostname().lower()
+    return is_address(name) or name in ('localhost', address.lower(), own, own + '.local')
+
+
+def is_own_page(headers: Mapping[str, str]) -> bool:
+    """Whether a request comes from our page, or from no page at all (curl has no Origin)."""
+    if headers.get('Sec-Fetch-Site', 'same-origin') not in ('same-origin', 'none'):
+        return False
+    origin = headers.get('Origin')
+    return origin is None or origin.lower() == f'http://{headers.get("Host", "").lower()}'
+
+
+def is_token(given: str | None, expected: str) -> bool:
+    """Whether the token is right, compared in constant time."""
+    # A header may hold bytes that are not text; they appear as lone surrogates.
+    return given is not None and hmac.compare_digest(
+        given.encode(errors='surrogateescape'), expected.encode(errors='surrogateescape')
+    )
+
 
 VIEWERS = 16
 CONNECTIONS = 100
@@ -197,7 +253,7 @@ class GatedServer(abc.ABC):
 
     def _may(self, request: web.Request) -> bool:
         """Whether a request comes from a page that may ask for what is not only looked at."""
-        if access.is_own_page(request.headers):
+        if is_own_page(request.headers):
             return True
         return (
             request.path == self.websocket_path
@@ -206,7 +262,7 @@ class GatedServer(abc.ABC):
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        if not access.is_own_host(request.headers.get('Host', ''), self._address):
+        if not is_own_host(request.headers.get('Host', ''), self._address):
             return web.Response(status=403, text='this is not the name of this machine')
         asks = request.method != 'GET' or request.path == self.websocket_path or request.path.startswith('/api/')
         if asks and not self._may(request):

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.text import plain_number
 from psd_deflection.records import FloatArray
 from psd_deflection.run.monitor.feed import BlockResult
 

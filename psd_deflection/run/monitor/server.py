@@ -24,7 +24,7 @@ from typing import Any
 from aiohttp import web
 
 from psd_deflection import __version__
-from psd_deflection.base import page_files
+from psd_deflection.base import charts
 from psd_deflection.base.log import INFO, LogCallback
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import (
@@ -38,8 +38,7 @@ from psd_deflection.records import (
     SampleBlock,
 )
 from psd_deflection.rig.running import MonitorConfig
-from psd_deflection.run.monitor import access, metrics
-from psd_deflection.run.monitor.calibrating import PageCalibration
+from psd_deflection.run.monitor import gated, metrics
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
 from psd_deflection.run.monitor.history import AskedError, History, asked
@@ -53,7 +52,7 @@ from psd_deflection.run.monitor.served import (
     announce,
     withdraw,
 )
-from psd_deflection.run.monitor.shown import RejectedError, Shown
+from psd_deflection.run.monitor.shown import PageCalibration, RejectedError, Shown
 from psd_deflection.run.monitor.spectrum import Spectrum, density_json, line_entry
 from psd_deflection.run.recorder import new_folder
 
@@ -121,7 +120,7 @@ class MonitorServer(GatedServer):
         self._spectrum = Spectrum(shown.rig)
         self._density: tuple[int, str] = (0, 'null')
         self._last_density: FloatArray | None = None
-        alone = access.is_loopback(config.address)
+        alone = gated.is_loopback(config.address)
         self._control = config.control == 'on' or (config.control == 'local' and alone)
         self._announced: Path | None = None
         if self._control and not alone:
@@ -164,7 +163,7 @@ class MonitorServer(GatedServer):
         application.router.add_post('/api/calibrate', self._calibrate)
         application.on_shutdown.append(lambda _: self._calibration.close())
         application.router.add_get('/page/charts.js', self._charts)
-        application.router.add_static('/page/vendor', page_files.FOLDER / 'vendor')
+        application.router.add_static('/page/vendor', charts.FOLDER / 'vendor')
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
 
@@ -270,7 +269,7 @@ class MonitorServer(GatedServer):
         return web.FileResponse(PAGE / 'index.html')
 
     async def _charts(self, request: web.Request) -> web.StreamResponse:
-        return web.FileResponse(page_files.CHARTS)
+        return web.FileResponse(charts.CHARTS)
 
     async def _metrics(self, request: web.Request) -> web.StreamResponse:
         families = self._shown.metrics()
@@ -442,7 +441,7 @@ class MonitorServer(GatedServer):
         """Carry out ``action`` with the body of ``request``, if it is allowed; ``name`` is said, unless it is ''."""
         if not self._control:
             return _answer(403, f'rejected: {self._why_no_control()}')
-        if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
+        if self.token and not gated.is_token(request.headers.get(TOKEN_HEADER), self.token):
             return _answer(401, 'rejected: the token is missing or wrong; the address printed at the start has it')
         # A type that a form of another site cannot send.
         if request.content_type != 'application/json':

@@ -1,20 +1,62 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What every source of error does to ΔX, ΔY and θ of one rig under one load."""
+"""What every source of error does to ΔX, ΔY and θ of one rig under one load, and the load if the user names none."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from psd_deflection.rig.config import Rig, check_two_psds
-from psd_deflection.studies.budget.estimate import method_of
-from psd_deflection.studies.budget.evaluate import draws, evaluate, monte_carlo
-from psd_deflection.studies.budget.expanded import Interval, interval_of
+import numpy as np
+
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.rig.config import Rig, check_two_psds, load_rig
+from psd_deflection.studies.budget.chain import MeasuringChain, measure, method_of
+from psd_deflection.studies.budget.evaluate import Interval, draws, evaluate, interval_of, monte_carlo
 from psd_deflection.studies.budget.inputs import read_inputs
-from psd_deflection.studies.budget.load import default_load
 from psd_deflection.studies.budget.result import Budgeted
 from psd_deflection.studies.budget.term import Contribution, Situation
+
+SIDEBAR_FORCE = 50.0
+"""N: the largest load of the thesis (chapter 5), hung on a sidebar one link length out on +X."""
+
+SHARE = 0.5
+"""Part of the way from its zero to the edge of the active area that a dot moves on a rig that is not the thesis's."""
+
+
+def default_load(rig: Rig) -> tuple[float, float, float]:
+    """Return a weight on a sidebar one link length out on +X: Fx N, Fy N, Tz N m.
+
+    For the link and the detectors of the thesis its 50 N. For others as much as moves the first dot ``SHARE`` of the
+    way to the edge of its active area, to two figures.
+    """
+    length = rig.link.length
+    if _has_the_thesis_layout(rig):
+        return 0.0, -SIDEBAR_FORCE, -SIDEBAR_FORCE * length
+    chain = MeasuringChain.of(rig)
+    statics = LinkStatics.from_rig(rig)
+    # So small a turn that everything is linear in it.
+    unit = 1e-6 * length / max(abs(v) for v in statics.deflection(0.0, -1.0, -length))
+    pose = np.array(statics.deflection(0.0, -unit, -unit * length))
+    moved, zero = (v[0] for v in measure(chain, pose))
+    slope = (moved - measure(chain, np.zeros(3))[0][0]) / unit
+    room = chain.half_area - np.sign(slope) * zero
+    with np.errstate(divide='ignore'):
+        force = float(np.min(SHARE * room / np.abs(slope)))
+    force = max(force, 0.0)
+    if force > 0.0:
+        step = 10.0 ** (math.floor(math.log10(force)) - 1)
+        force = round(math.floor(force / step) * step, 12)
+    return 0.0, -force, -force * length
+
+
+def _has_the_thesis_layout(rig: Rig) -> bool:
+    nominal = load_rig()
+    return rig.link == nominal.link and all(
+        (a.center, a.height, a.active_area) == (b.center, b.height, b.active_area)
+        for a, b in zip(rig.psds, nominal.psds, strict=True)
+    )
 
 
 @dataclass(frozen=True)

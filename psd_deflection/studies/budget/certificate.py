@@ -4,7 +4,7 @@
 
 What a calibration measured is known with its uncertainty: parameters p with a covariance, by the reference. An error
 dp of what the rig file says of them makes the pose wrong by c dp, c = -K S^-1 df/dp
-(:mod:`psd_deflection.model.misalignment.parameter_covariance`, K the weighted least squares of the rig's solver). They
+(:mod:`psd_deflection.model.misalignment.rig`, K the weighted least squares of the rig's solver). They
 are correlated, so that their part of u_c^2 is c^T P c (JCGM 100:2008, equation 16). Nothing in the recordings sees an
 error in the scale of the reference: it is an input. What acts since the zero was taken, drift, air, noise, are the
 causes of the error budget that no calibration measures. The zero is taken before use, so the calibration's own does not
@@ -23,13 +23,11 @@ import numpy as np
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.misalignment.model import ALL, ZERO
-from psd_deflection.model.misalignment.parameter_covariance import dots_by_parameters
-from psd_deflection.model.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
+from psd_deflection.model.misalignment.rig import dots_by_parameters, is_calibrated, known_of_rig, vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.budget.estimate import ExactEstimator, method_of
-from psd_deflection.studies.budget.evaluate import CAUSES
-from psd_deflection.studies.budget.expanded import Expanded, expanded
+from psd_deflection.studies.budget.chain import ExactEstimator, method_of
+from psd_deflection.studies.budget.evaluate import CAUSES, Expanded, expanded
 from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, is_assumed, read_inputs
 from psd_deflection.studies.budget.term import Kind, Situation
 

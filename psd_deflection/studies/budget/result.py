@@ -18,8 +18,7 @@ from psd_deflection.base.axes import UNITS as POSE_UNITS
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, columns, columns_of, text_column
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.budget.evaluate import Budget
-from psd_deflection.studies.budget.expanded import PROBABILITY, Interval, difference
+from psd_deflection.studies.budget.evaluate import PROBABILITY, Budget, Interval, difference
 from psd_deflection.studies.budget.pictures import LEAST, bars_of
 from psd_deflection.studies.budget.term import Cause, Contribution, Kind
 from psd_deflection.studies.study import PageSection, StudyResult

@@ -30,8 +30,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.budget.chain import MeasuringChain, measure
-from psd_deflection.studies.budget.estimate import Estimator, estimator_of
+from psd_deflection.studies.budget.chain import Estimator, MeasuringChain, estimator_of, measure
 from psd_deflection.studies.budget.inputs import is_assumed
 
 ROOT_3 = math.sqrt(3.0)

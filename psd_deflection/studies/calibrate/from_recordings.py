@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.recordings.read.grid import MAX_SAMPLES, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import References, read_references, references_in
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds
+from psd_deflection.recordings.sample_table import MAX_SAMPLES, held_at
 from psd_deflection.recordings.spans import FULL, Span
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values

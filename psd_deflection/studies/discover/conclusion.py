@@ -26,18 +26,17 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.check.wirings import line
-from psd_deflection.studies.discover.laws.laws import WRITTEN, FoundLaw
+from psd_deflection.studies.discover.hidden import RIG_NUMBERS
+from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
+from psd_deflection.studies.discover.redundant import STAGES
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import Localisation
 from psd_deflection.studies.discover.search.predictive import Predictive
-from psd_deflection.studies.discover.search.remainder import Remainder
 from psd_deflection.studies.discover.search.search import SearchResult
-from psd_deflection.studies.discover.search.ties import ties
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
+from psd_deflection.studies.discover.search.smooth import Remainder
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown, ties
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS
-from psd_deflection.studies.discover.setup.redundant import STAGES
 from psd_deflection.studies.discover.trees import (
     covariance_tree,
     effect_tree,

@@ -19,16 +19,15 @@ import numpy as np
 
 from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.load_words import load_history, temperature_table
-from psd_deflection.model.simulation.loads import SIDEBAR_ARM
+from psd_deflection.model.simulation.loads import SIDEBAR_ARM, load_history, temperature_table
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.studies.discover.hidden import only_in
 from psd_deflection.studies.discover.search.fit import STEP, Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import only_in
-from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
+from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, fine_means
 
 ROOM = 0.8
 """Share of the way from an unloaded dot to the edge of its sensor, or of the converter's range, that a load may use."""

@@ -14,9 +14,8 @@ import numpy as np
 
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
-from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.read.readings_table import (
+from psd_deflection.recordings.read.references import (
     IN_MILLIMETRES,
     KNOWN,
     TIMES,
@@ -26,7 +25,7 @@ from psd_deflection.recordings.read.readings_table import (
 )
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig, zero_variances_at_end
-from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN
+from psd_deflection.recordings.sample_table import MAX_SAMPLES, TEMPERATURE_COLUMN, digest_of, held_at
 from psd_deflection.recordings.spans import FULL, Span
 from psd_deflection.records import FloatArray, channel_names, dot_channels
 from psd_deflection.rig.config import Rig, load_rig, replace_values
@@ -34,9 +33,8 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
-from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
-from psd_deflection.studies.discover.reference_readings import Resting, resting_in, resting_rows
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.plants import Readings, ReadingsPlant, Resting, resting_in, resting_rows
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import GIVEN_RIG, Notify, warn_caller
 
 

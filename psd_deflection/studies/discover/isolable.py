@@ -32,9 +32,8 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import SEPARATES
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
-from psd_deflection.studies.discover.search.screen import Screen, solve_observable
+from psd_deflection.studies.discover.search.screen import Candidate, Screen, solve_observable
 from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
 from psd_deflection.studies.study import PageSection, StudyResult
 

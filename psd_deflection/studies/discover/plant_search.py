@@ -28,14 +28,11 @@ from psd_deflection.studies.discover.plants import Model, Plant, check_plant, me
 from psd_deflection.studies.discover.problem import Machine, Progress
 from psd_deflection.studies.discover.report import sections
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import heldout_tables
+from psd_deflection.studies.discover.search.fit import Fit, heldout_tables, refit
 from psd_deflection.studies.discover.search.localise import Cell, Localisation, dependences
 from psd_deflection.studies.discover.search.predictive import as_model
-from psd_deflection.studies.discover.search.remainder import Table
-from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
-from psd_deflection.studies.discover.search.smooth import Smooth, smooth_of
+from psd_deflection.studies.discover.search.screen import Screen, candidates, signatures_beside
+from psd_deflection.studies.discover.search.smooth import Smooth, Table, smooth_of
 from psd_deflection.studies.discover.search.weighing import SIGNIFICANT, sd_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, search, solve, weigh, where
 from psd_deflection.studies.study import PageSection

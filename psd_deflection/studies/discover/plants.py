@@ -1,18 +1,35 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a machine that simulates itself tells of itself, so that :func:`discover_in` can ask it."""
+"""What a machine that simulates itself tells of itself, so that :func:`discover_in` can ask it; and a table of readings
+as such a machine."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.catalogue import catalogue, effects_for, effects_of_rig, sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.model.solvers import solver_from_rig
+from psd_deflection.recordings.read.references import TIMES, ReadingsTable, references_in
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.records import FloatArray, IntArray, dot_names
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.discover.conclusion import model_yaml
+from psd_deflection.studies.discover.noise import settling
+from psd_deflection.studies.discover.search.fit import BoolArray
+from psd_deflection.studies.loads.plate_motion import dots_of
+from psd_deflection.studies.study import Notify, warn_caller
 
 FOLDS = 4
 """Parts that are left out in turn, at least; few cases are cut into pieces."""
@@ -138,3 +155,274 @@ def check_plant(plant: Plant) -> None:
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise ConfigError(f'library: {", ".join(twice)} is there twice, in library or nuisance')
+
+
+CHANNELS: Mapping[str, tuple[str, ...]] = {
+    'dots': dot_names(2),
+    'estimates': ('dx', 'dy', 'theta'),
+    'poses': ('ref_dx', 'ref_dy', 'ref_theta'),
+}
+"""Of two PSDs."""
+OF_POSE = ('µm', 'µm', 'µrad')
+MICRO = 1e6
+LEAST_LOADS = 4
+TABLE_FOLDS = 6
+"""Parts into which the loads are dealt in turn; each is left out of the fit once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """One table. ``loads`` (n, 3) N, N, N m; ``values`` (n, channels) of ``kind``; ``temperature`` (n,) degrees Celsius
+    or None.
+
+    ``dots``: readings of the PSDs, m; ``estimates``: what the daemon made of them, m and rad; ``poses``: the tip's pose
+    as something else measured it. NaN where nothing was read. Raises RecordingError if there is too little to search.
+    """
+
+    name: str
+    rig: Rig
+    kind: str
+    loads: FloatArray
+    values: FloatArray
+    temperature: FloatArray | None = None
+    digest: str = ''
+
+    def __post_init__(self) -> None:
+        count = len(self.distinct)
+        if count < LEAST_LOADS:
+            raise RecordingError(f'{self.name}: {count} different loads: discover needs at least {LEAST_LOADS}')
+
+    @property
+    def distinct(self) -> FloatArray:
+        """The different loads (k, 3)."""
+        return np.asarray(np.unique(self.loads, axis=0))
+
+    @property
+    def psds(self) -> int:
+        """How many PSDs the rig has."""
+        return len(self.rig.psds)
+
+
+class ReadingsPlant(Plant):
+    """The rig as its tables show it. All tables hold the same kind of readings; each has its own rig.
+
+    ``known``: the effects that the rig file has already. Raises RecordingError if the tables differ in kind, or their
+    rigs in the number of PSDs.
+    """
+
+    def __init__(
+        self,
+        tables: Sequence[Readings],
+        without: Sequence[str] = (),
+        params_file: str | Path | None = None,
+        notify: Notify = warn_caller,
+    ) -> None:
+        """``params_file``: of the rig, if it has one. ``notify`` gets a warning if that cannot be edited."""
+        kinds = {t.kind for t in tables}
+        if len(kinds) > 1:
+            words = ' and '.join(','.join(CHANNELS[k]) for k in sorted(kinds))
+            raise RecordingError(f'{", ".join(t.name for t in tables)}: one has {words}: search them one by one')
+        different = next((t for t in tables if t.psds != tables[0].psds), None)
+        if different is not None:
+            raise RecordingError(
+                f'{different.name}: is of {different.psds} PSDs, {tables[0].name} of {tables[0].psds}: '
+                'search them one by one'
+            )
+        self.tables = tuple(tables)
+        self._params_file, self._notify = params_file, notify
+        self.kind = tables[0].kind
+        of_dots = self.kind == 'dots'
+        self.channels = dot_names(tables[0].psds) if of_dots else CHANNELS[self.kind]
+        self.units = ('µm',) * len(self.channels) if of_dots else OF_POSE
+        if not of_dots:
+            # A twist counts as what it moves at the distance of the PSDs.
+            self.levers = (1.0, 1.0, float(np.sqrt(np.mean(np.sum(tables[0].rig.centers ** 2, axis=1)))))
+        self.cases = tuple(t.name for t in tables)
+        self.physics = Physics.of(tables[0].rig)
+        self.known = tuple(effects_of_rig(tables[0].rig))
+        self.library = tuple(
+            e
+            for effect in effects_for(tables[0].psds)
+            if effect.name not in without and not effect.value_grid and (e := self._observable(effect)) is not None
+        )
+
+    def measured(self) -> Sequence[FloatArray]:
+        """Return the readings, µm and µrad."""
+        return [MICRO * t.values.T for t in self.tables]
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        """Return the loads, and the temperature where every table has it."""
+        names = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
+        out = {name: [t.loads[:, i] for t in self.tables] for i, name in enumerate(names)}
+        warm = [t.temperature for t in self.tables if t.temperature is not None]
+        if len(warm) == len(self.tables):
+            out['temperature / °C'] = warm
+        return out
+
+    def simulate(self, model: Model) -> Sequence[FloatArray]:
+        """What the rig would read with the effects of ``model``, each once."""
+        every = catalogue(self.tables[0].psds)
+        return self.simulate_effects([ActiveEffect(every[name], values) for name, values in model.items()])
+
+    def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:
+        """What the rig would read with ``effects``."""
+        return [self._rows(t, effects, np.arange(len(t.loads))) for t in self.tables]
+
+    def parts(self) -> Sequence[IntArray]:
+        """All rows of one load are in one part."""
+        out = []
+        for t in self.tables:
+            _, index = np.unique(t.loads, axis=0, return_inverse=True)
+            out.append(np.asarray(index.ravel() % min(TABLE_FOLDS, len(t.distinct)), dtype=np.int64))
+        return out
+
+    def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
+        """Return the rig file with the effects."""
+        rig = self.tables[0].rig
+        return {'model.yaml': model_yaml(self._params_file, rig, [*self.known, *effects], {}, self._notify)}
+
+    def _rows(self, table: Readings, effects: Sequence[ActiveEffect], order: IntArray) -> FloatArray:
+        """Return the readings (channels, n) of the rows, which are simulated in ``order``."""
+        rig, warm = table.rig, table.temperature
+        model = ForwardModel(rig, sort_effects([*self.known, *effects]), settled=True)
+        samples = model.expect(table.loads[order], None if warm is None else warm[order])
+        dots = dots_of(rig, samples.volts)
+        back = np.argsort(order)
+        if self.kind == 'dots':
+            return np.asarray(MICRO * dots[:, back])
+        if self.kind == 'poses':
+            return np.asarray(MICRO * samples.pose[:, back])
+        pose = solver_from_rig(rig.estimator.solver, rig).solve_many(dots.T, dot_noise_variances(rig)).pose
+        return np.asarray(MICRO * pose.T[:, back])
+
+    def _observable(self, effect: Effect) -> Effect | None:
+        """``effect`` without the choices that make no difference here; None if a table cannot show it."""
+        table = self.tables[0]
+        forward = np.arange(len(table.loads))
+        # The first row stays: temperatures count from it.
+        backward = np.concatenate((forward[:1], forward[:0:-1]))
+        by_choice: dict[tuple[float, ...], list[FloatArray]] = {}
+        choices = [p for p in effect.parameters if p.kind == 'choice' and not p.each]
+        for choice in effect.variants(table.psds):
+            active = ActiveEffect(effect, with_first_dose(effect, effect.off_values(self.physics, choice)))
+            rows = self._rows(table, [active], forward)
+            if not np.allclose(rows, self._rows(table, [active], backward), rtol=1e-9, atol=1e-6):
+                return None
+            by_choice.setdefault(tuple(choice[p.name] for p in choices), []).append(rows)
+        first, *other_choices = by_choice.values()
+        if choices and all(np.array_equal(a, b) for other in other_choices for a, b in zip(first, other, strict=True)):
+            return dataclasses.replace(effect, parameters=tuple(map(fixed_choice, effect.parameters)))
+        return effect
+
+
+def with_first_dose(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
+    """``effect`` with a small size and the first shape that its declaration names."""
+    out = dict(off)
+    for p in effect.parameters:
+        if p.kind in ('amplitude', 'coupled'):
+            dose = p.grid[-1] if p.grid else out[p.name] + p.scale
+            out[p.name] = min(max(dose, p.minimum), p.maximum)
+        elif p.kind == 'shape' and p.grid:
+            out[p.name] = p.grid[0]
+    return out
+
+
+def fixed_choice(p: EffectParameter) -> EffectParameter:
+    """Return a choice with one value, for one that makes no difference at rest; anything else as it is."""
+    if p.kind != 'choice' or p.each:
+        return p
+    return dataclasses.replace(p, choices=(int(p.nominal) if p.nominal in p.choices else p.choices[0],))
+
+
+FEWEST = 3
+"""References of a row."""
+FAR = 5.0
+"""Standard deviations of most references under one load: what is further off is not under it."""
+MOST_OF_IT = 0.5
+"""Share of the time under one load that is waited for the link to come to rest, at most."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resting:
+    """``loads`` (k, 3) N, N, N m; ``poses`` (k, 3) m, m, rad; ``temperature`` (k,) degrees Celsius or None."""
+
+    loads: FloatArray
+    poses: FloatArray
+    temperature: FloatArray | None
+
+
+def resting_in(recording: Recording, rig: Rig) -> Resting:
+    """The references of a recording without samples. Raises RecordingError if it has no loads or too few of them."""
+    references = references_in(recording)
+    applied = sorted(recording.loads(), key=lambda load: load.t_ns)
+    if references is None or not applied:
+        raise RecordingError(
+            f'{recording.path}: holds references, but neither samples nor loads; loads (topic /link_tip/load) are '
+            f'needed to compare it with a simulation'
+        )
+    start = int(references.t_ns[0])
+    t = np.asarray((references.t_ns - start) * 1e-9, dtype=np.float64)
+    times = np.array([(a.t_ns - start) * 1e-9 for a in applied], dtype=np.float64)
+    warm = recording.temperatures()
+    at = np.array([(w.t_ns - start) * 1e-9 for w in warm])
+    celsius = np.asarray(np.interp(t, at, [w.celsius for w in warm]), dtype=np.float64) if warm else None
+    return _rows(
+        str(recording.path),
+        rig,
+        times,
+        np.array([a[1:] for a in applied], dtype=np.float64),
+        t,
+        references.poses,
+        celsius,
+    )
+
+
+def resting_rows(
+    table: ReadingsTable, rig: Rig, loads: FloatArray, poses: FloatArray, warm: FloatArray | None
+) -> Resting:
+    """The references of a table with times, of which each row says its load (n, 3); a pose that is not there is NaN."""
+    t = table.column(TIMES)
+    order = np.argsort(t, kind='stable')
+    celsius = None if warm is None else warm[order]
+    return _rows(str(table.path), rig, t[order], loads[order], t[order], poses[order], celsius)
+
+
+def _rows(
+    name: str,
+    rig: Rig,
+    annotated: FloatArray,
+    loads: FloatArray,
+    t: FloatArray,
+    poses: FloatArray,
+    warm: FloatArray | None,
+) -> Resting:
+    """Medians of ``poses`` (n, 3) at ``t`` (n,) s, between changes of ``loads`` (k, 3) that were noted at (k,) s.
+
+    A load is often noted late. If more than half of the time is under it, what is far from the median is not.
+    """
+    new = np.append(True, np.any(np.diff(loads, axis=0) != 0.0, axis=1))
+    starts, changed = annotated[new], loads[new]
+    stops = np.append(starts[1:], math.inf)
+    there = np.isfinite(poses).all(axis=1)
+    of, means, celsius = list[FloatArray](), list[FloatArray](), list[float]()
+    for load, start, stop in zip(changed, starts, stops, strict=True):
+        end = min(stop, float(t[-1]))
+        applied = there & (t >= start) & (t < stop)
+        if np.count_nonzero(applied) < FEWEST:
+            continue
+        settled_samples = (
+            applied & _near(poses, applied) & (t >= start + min(settling(rig), MOST_OF_IT * max(end - start, 0.0)))
+        )
+        if np.count_nonzero(settled_samples) >= FEWEST:
+            of.append(load)
+            means.append(np.median(poses[settled_samples], axis=0))
+            celsius.append(math.nan if warm is None else float(warm[settled_samples].mean()))
+    if not of:
+        raise RecordingError(f'{name}: no load hung for as long as {FEWEST} references')
+    return Resting(np.array(of), np.array(means), None if warm is None else np.array(celsius))
+
+
+def _near(poses: FloatArray, applied: BoolArray) -> BoolArray:
+    """(n,): whether ``poses`` (n, 3) are about as near to the median of those that ``applied`` as most of them."""
+    off = np.abs(poses - np.median(poses[applied], axis=0))
+    return np.asarray((off <= FAR * 1.4826 * np.median(off[applied], axis=0)).all(axis=1))

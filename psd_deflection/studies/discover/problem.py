@@ -15,17 +15,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.planning import Suggestion
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
 from psd_deflection.studies.discover.search.localise import NOWHERE, Localisation
 from psd_deflection.studies.discover.search.predictive import Predictive
-from psd_deflection.studies.discover.search.remainder import Remainder, Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
-from psd_deflection.studies.discover.search.smooth import Smooth
+from psd_deflection.studies.discover.search.smooth import Remainder, Smooth, Table
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 
 Progress = Callable[[str], None]

@@ -22,20 +22,25 @@ from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import note_finding
+from psd_deflection.studies.discover.applied import directions, in_time, levels, of_plateau, swayed, times
+from psd_deflection.studies.discover.cleaning import clean, time_loads
+from psd_deflection.studies.discover.hidden import Direction, LoadDirection, ZeroDirection, beginning
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.free import Direction, LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.applied import directions, in_time, levels, of_plateau, swayed, times
-from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
-from psd_deflection.studies.discover.setup.hidden import beginning
-from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
-from psd_deflection.studies.discover.setup.setup import correct_wiring, likely_delays
+from psd_deflection.studies.discover.setup import correct_wiring, likely_delays
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads
+from psd_deflection.studies.loads.effective import (
+    SwayingLoad,
+    UnannotatedTime,
+    excluded,
+    swung,
+    unannotated_times,
+    without_times,
+)
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_applied, wrong_notes_against
-from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swung
-from psd_deflection.studies.loads.unannotated import UnannotatedTime, unannotated_times, without_times
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""

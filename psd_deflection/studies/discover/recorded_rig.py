@@ -14,28 +14,28 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover import recorded as recordings_ready
+from psd_deflection.studies.discover.hidden import FIRST, SETUP, mistakes
 from psd_deflection.studies.discover.observation import Observation, check_same_psds
 from psd_deflection.studies.discover.planning import Suggestion, suggest
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress
 from psd_deflection.studies.discover.recorded import Recorded
+from psd_deflection.studies.discover.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import Localisation, localise, regressors
-from psd_deflection.studies.discover.search.remainder import Table
-from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.signatures import (
+from psd_deflection.studies.discover.search.screen import (
     Candidate,
     Columns,
+    Screen,
     SignatureBank,
     candidates,
     signatures_beside,
 )
+from psd_deflection.studies.discover.search.smooth import Table
 from psd_deflection.studies.discover.search.trials import FAR, far
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
-from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
-from psd_deflection.studies.discover.setup.setup import likely_jumps
+from psd_deflection.studies.discover.setup import likely_jumps
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import html
 import itertools
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,14 +20,13 @@ from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import FloatArray, channel_names
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
-from psd_deflection.studies.discover.laws.law_features import known_values
-from psd_deflection.studies.discover.laws.laws import FoundLaw
-from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.law_features import known_values
+from psd_deflection.studies.discover.laws import FoundLaw
+from psd_deflection.studies.discover.search.comparison import BANDS, Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.predictive import Predictive
 from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.smooth import Smooth
-from psd_deflection.studies.discover.search.trust import BANDS
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 from psd_deflection.studies.discover.trees import parameters_of, size_of
 from psd_deflection.studies.loads.plate_motion import dots_of
@@ -352,3 +352,12 @@ def _how(discovery: Conclusion) -> list[str | Drawing]:
         '</details><details><summary>Steps</summary>',
         f'<p class=quiet>{html.escape(trace)}; {discovery.simulations} forward simulations.</p></details>',
     ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Discovery(RigConclusion):
+    """See :class:`~psd_deflection.studies.discover.conclusion.RigConclusion`."""
+
+    def sections(self) -> Iterable[PageSection]:
+        """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
+        return sections(self)

@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress, Step
-from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
+from psd_deflection.studies.discover.search.fit import Fit, heldout_gain, heldout_tables, refit
 from psd_deflection.studies.discover.search.predictive import predictive_of
-from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
 from psd_deflection.studies.discover.search.search import Search
+from psd_deflection.studies.discover.search.smooth import Remainder, remainder_of
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
     ALTERNATIVE_BIC,
@@ -32,6 +30,7 @@ from psd_deflection.studies.discover.search.weighing import (
     Alternative,
     NamedEffect,
     Unknown,
+    coincidences,
     heldout_per_channel_of,
     no_noise,
     per_channel_of,

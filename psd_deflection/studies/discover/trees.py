@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, covariance_of
 

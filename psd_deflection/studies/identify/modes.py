@@ -13,7 +13,7 @@ search begins where most of the motion is ringing. How many modes there are is t
 leaves: two that beat look like one for a few periods only.
 
 If the link never rings alone, its mode is that of its spectrum
-(:mod:`psd_deflection.studies.identify.operation`).
+(:mod:`psd_deflection.studies.identify.spectra`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,18 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.identify.axis_modes import LEAST_DAMPING, MOST_DAMPING, AxisModes, Mode
-from psd_deflection.studies.identify.operation import mode_in_operation
-from psd_deflection.studies.identify.spectra import coloured_noise, exceeds_noise, filled_up, loudest_peak, white_noise
+from psd_deflection.studies.identify.spectra import (
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    AxisModes,
+    Mode,
+    coloured_noise,
+    exceeds_noise,
+    filled_up,
+    loudest_peak,
+    mode_in_operation,
+    white_noise,
+)
 
 MOST_MODES = 3
 WINDOW = 6.0

@@ -17,7 +17,7 @@ from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Rule, Series
 from psd_deflection.base.pages import table
 from psd_deflection.recordings.charts import FROM_FIRST
 from psd_deflection.records import FloatArray, Moment
-from psd_deflection.studies.identify.axis_modes import AxisModes
+from psd_deflection.studies.identify.spectra import AxisModes
 from psd_deflection.studies.study import PageSection
 
 MEASURED: Final = 'blue'

@@ -43,3 +43,27 @@ def across_plate(rig: Rig, volts: FloatArray) -> FloatArray:
 def across_of(rig: Rig) -> FloatArray:
     """(2P - 3, 2P): the combinations of the dots, orthonormal, that no movement of the plate moves."""
     return np.asarray(null_space(design_matrix(rig.centers + rig.zeros).T).T)
+
+
+FINE_SECONDS = 0.004
+
+
+def fine_means(rows: FloatArray, size: int, present: FloatArray | None = None) -> FloatArray:
+    """Means (k, n // size) over ``size`` samples of rows (k, n).
+
+    ``present`` (k, n): 1 for the samples that count, else 0; all of them by default. A mean of none is 0.
+    """
+    n = rows.shape[1] // size
+    cut = rows[:, : n * size].reshape(rows.shape[0], n, size)
+    if present is None:
+        return _sums(cut) / size
+    weights = present[:, : n * size].reshape(cut.shape)
+    return _sums(cut * weights) / np.maximum(_sums(weights), 1.0)
+
+
+def _sums(cut: FloatArray) -> FloatArray:
+    """Sums over the last axis of ``cut`` (k, n, size): numpy's own sum over so few is several times slower."""
+    total = cut[:, :, 0].copy()
+    for i in range(1, cut.shape[2]):
+        total += cut[:, :, i]
+    return total

@@ -21,8 +21,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.annotated_times import ordinal, unannotated_steps
-from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
-from psd_deflection.studies.loads.plate_motion import across_plate, dot_rows, moved_plate
+from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, across_plate, dot_rows, fine_means, moved_plate
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]

@@ -26,15 +26,17 @@ from psd_deflection.model.plate.plate import tied_pose
 from psd_deflection.model.solvers.registry import make_solver
 from psd_deflection.studies.thesis.comparison import (
     CONDITIONS,
+    DIAMETERS,
     DIRECT,
+    FORCES,
     SIDEBAR,
     VARIANCES,
     dots_of,
     errors,
     methods,
+    spot_run,
     thesis_geometry,
 )
-from psd_deflection.studies.thesis.large_spots import DIAMETERS, FORCES, spot_run
 
 _STYLE: Any = {
     'figure.dpi': 110,

@@ -19,7 +19,7 @@ from psd_deflection.recordings.read.references import read_references, read_run,
 from psd_deflection.records import FloatArray, IntArray, Moment, SampleBlock
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.study import Opened
-from psd_deflection.studies.validate.motion import Motion, Solve
+from psd_deflection.studies.validate.clock import Motion, Solve
 
 ALL = 'all'
 

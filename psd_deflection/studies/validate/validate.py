@@ -1,19 +1,149 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the motion that the detectors saw with an independent reference."""
+"""Compares the motion of a recording, as each solver has it, with a reference: the answer, its tree and its page."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.tables import Column, Table, columns, columns_of
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.study import PageSection, StudyResult
 from psd_deflection.studies.validate.agreement import Agreement, agreement
-from psd_deflection.studies.validate.clock import FEWEST, clock_offset
+from psd_deflection.studies.validate.clock import FEWEST, Offset, clock_offset
 from psd_deflection.studies.validate.from_recordings import ValidateProblem
-from psd_deflection.studies.validate.result import Validated
+
+
+@dataclass(frozen=True, repr=False)
+class Validated(StudyResult):
+    """The answer of :func:`~psd_deflection.studies.validate.validate.validate`.
+
+    ``t`` (k,), s, when the references were taken by the clock of the samples; ``reference`` (k, 3), m, m, rad;
+    ``estimates``: of each solver at these times (k, 3), NaN if it has no answer. ``agreements``: of each solver, for
+    dX, dY, theta. ``offset``: between the clocks; ``applied``: whether it was removed. ``covered``: share of
+    differences within 1.96 standard deviations of estimate and reference together, for each axis; NaN if the
+    reference does not state its own. ``excluded``: references without samples about them.
+    """
+
+    study, json_name = 'validate', 'validate.json'
+    title = 'Estimate against reference'
+
+    problem: ValidateProblem
+    t: FloatArray
+    reference: FloatArray
+    estimates: dict[str, FloatArray]
+    agreements: dict[str, tuple[Agreement, Agreement, Agreement]]
+    offset: Offset
+    applied: bool
+    covered: tuple[float, float, float]
+    excluded: int
+
+    @property
+    def solver(self) -> str:
+        """That of the rig."""
+        return self.problem.solver
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """What was compared, by name."""
+        return self.problem.sources
+
+    def sentences(self) -> list[str]:
+        """Clock, bias and scale of each axis, cover, and what was left out."""
+        out = [self.offset.sentence]
+        if self.applied:
+            out.append('The offset is removed in what follows.')
+        elif self.offset.determined and abs(self.offset.value) > 1.96 * self.offset.sd:
+            out.append('It is not removed in what follows; --align removes it.')
+        for i, name in enumerate(SYMBOLS):
+            a = self.agreements[self.solver][i]
+            text = (
+                f'{name}: the estimate is {_pm(a.bias, a.bias_sd, i)} off on average; 95 % of the differences lie '
+                f'between {SHOWN[i] * a.limits[0]:+.1f} and {SHOWN[i] * a.limits[1]:+.1f} {SHOWN_UNITS[i]}'
+            )
+            if a.mirrored:
+                text += (
+                    '; the reference moves the other way: turn its sign (of a camera, camera.view), '
+                    'or that of the readings if `psd-deflection check` says so'
+                )
+            if math.isfinite(a.scale):
+                text += f'; it is {100.0 * a.scale:+.3f} ± {196.0 * a.scale_sd:.3f} % larger'
+            out.append(text + '.')
+        if math.isfinite(self.covered[0]):
+            cover = ', '.join(f'{n} {100.0 * c:.1f} %' for n, c in zip(SYMBOLS, self.covered, strict=True))
+            out.append(f'Differences within 1.96 standard deviations of both instruments (95 % expected): {cover}.')
+        if self.excluded:
+            total = len(self.t) + self.excluded
+            out.append(f'{self.excluded} of {total} references have no samples about them and are left out.')
+        if rejected := self.problem.rejected:
+            reasons = ', '.join(f'{reason} {count}' for reason, count in sorted(rejected.items()))
+            out.append(f'The reference gave no answer {sum(rejected.values())} times: {reasons}.')
+        return out
+
+    def lines(self) -> list[str]:
+        """Return the sentences and the table of solvers."""
+        return [*self.sentences(), '', *columns(self.rows(), left=3).splitlines()]
+
+    def rows(self) -> list[list[str]]:
+        """The table of solvers, its head first: errors as in Table 5.1 of the thesis, with bias, scale, noise."""
+        out = [['solver', 'axis', 'unit', 'bias', 'scale %', 'noise', 'rms', 'largest', '% of deflection']]
+        for name, three in self.agreements.items():
+            for i, a in enumerate(three):
+                out.append(
+                    [
+                        name if i == 0 else '',
+                        SYMBOLS[i],
+                        SHOWN_UNITS[i],
+                        f'{SHOWN[i] * a.bias:+.2f}',
+                        f'{100.0 * a.scale:+.3f}' if math.isfinite(a.scale) else '-',
+                        f'{SHOWN[i] * a.noise:.2f}',
+                        f'{SHOWN[i] * a.rms:.2f}',
+                        f'{SHOWN[i] * a.largest:.2f}',
+                        f'{100.0 * a.share:.2f}' if math.isfinite(a.share) else '-',
+                    ]
+                )
+        return out
+
+    def tree(self) -> dict[str, Any]:
+        """In SI units."""
+        offset = {**asdict(self.offset), 'interval': self.offset.interval, 'determined': self.offset.determined}
+        return {
+            'solver': self.solver,
+            'references': len(self.t),
+            'left_out': self.excluded,
+            'rejected': dict(self.problem.rejected),
+            'offset': {**offset, 'applied': self.applied, 'unit': 's', 'sentence': self.offset.sentence},
+            'solvers': {
+                name: {axis: {'unit': unit, **asdict(a)} for axis, unit, a in zip(AXES, UNITS, three, strict=True)}
+                for name, three in self.agreements.items()
+            },
+            'covered': dict(zip(AXES, self.covered, strict=True)),
+        }
+
+    def table(self) -> Table:
+        """Return one row a reference over ``t`` (s): the ``reference_`` pose, and that of each solver (m, m, rad)."""
+        parts = [('reference', self.reference), *self.estimates.items()]
+        out = [c for name, pose in parts for c in columns_of(pose, [f'{name}_{a}' for a in AXES], UNITS, [name] * 3)]
+        return Table(Column('t', self.t, 's', 'by the clock of the samples'), out, {'solver': self.solver})
+
+    def sections(self) -> Iterable[PageSection]:
+        """Return the solvers, over time, agreement."""
+        from psd_deflection.studies.validate.pictures import DrawnAgreement, sections
+
+        of = self.solver
+        shown = DrawnAgreement(of, self.t, self.estimates[of], self.reference, self.agreements[of], self.problem.marks)
+        return sections(shown, self.rows())
+
+
+def _pm(value: float, sd: float, axis: int) -> str:
+    return f'{SHOWN[axis] * value:+.2f} ± {196e-2 * SHOWN[axis] * sd:.2f} {SHOWN_UNITS[axis]}'
 
 
 def validate(problem: ValidateProblem) -> Validated:

@@ -7,8 +7,7 @@ from __future__ import annotations
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.charts import moments
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay.engine import replayed
-from psd_deflection.recordings.replay.watched import WatchedReplay
+from psd_deflection.recordings.replay.engine import WatchedReplay, replayed
 from psd_deflection.records import SampleBlock
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.watch.result import WatchedRun

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psd_deflection.arms.chains.chain import PATIENCE, Joined, Joiner
 from psd_deflection.arms.chains.chain_file import ChainSettings, read_chain
-from psd_deflection.arms.chains.joining import PATIENCE, Joined, Joiner
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import DeflectionEstimate
 

@@ -15,7 +15,7 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.base.sanitize import sanitize
+from psd_deflection.base.text import sanitize
 from psd_deflection.devices.protocol.frames import (
     MAX_ENCODED,
     BadFrame,

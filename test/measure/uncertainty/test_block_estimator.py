@@ -13,8 +13,8 @@ from scipy.stats import chi2
 
 from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
 from psd_deflection.measure.uncertainty.consistency import CONTRADICTS, ConsistencyResult
-from psd_deflection.measure.uncertainty.plate_model import PlateModel
-from psd_deflection.measure.uncertainty.rest import why_moving
+from psd_deflection.measure.uncertainty.psd_set import PlateModel
+from psd_deflection.measure.uncertainty.vibration import why_moving
 from psd_deflection.model.plate.plate import Tilts, flat_points, plate_points
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig

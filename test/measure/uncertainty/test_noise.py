@@ -10,7 +10,7 @@ import pytest
 
 from blind.coverage import Row, coarse, motion, volts_of
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.measure.uncertainty.converter import ConverterSteps
+from psd_deflection.measure.uncertainty.block_estimator import ConverterSteps
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise, undithered
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from psd_deflection.measure.averaging import BlockMeasures, measured
 from psd_deflection.measure.health import Loudness, OpticsHealth, Verdict
-from psd_deflection.measure.measures import BlockMeasures, measured
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock
 from psd_deflection.rig.config import load_rig
 from test.altered import altered

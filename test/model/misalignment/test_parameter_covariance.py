@@ -10,8 +10,7 @@ import pytest
 from psd_deflection.measure.estimation import SYSTEMATIC, ZERO_VARIANCES
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.misalignment.model import COUNT, INDEX, readings
-from psd_deflection.model.misalignment.parameter_covariance import ParameterCovariance
-from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
+from psd_deflection.model.misalignment.rig import ParameterCovariance, known_of_rig, vector_of_rig
 from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
 from psd_deflection.rig.config import Rig, rig_from_values
 from test import streams
@@ -71,7 +70,7 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
 
 @pytest.mark.slow
 def test_the_polynomial_is_what_it_stands_for() -> None:
-    from psd_deflection.model.misalignment.parameter_covariance import dots_by_parameters
+    from psd_deflection.model.misalignment.rig import dots_by_parameters
 
     rig = calibrated()
     parameter_covariance = ParameterCovariance.from_rig(rig)

@@ -12,7 +12,7 @@ import pytest
 from psd_deflection.base.errors import SolverError
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.plate.landing import landing, landings
-from psd_deflection.model.plate.layout import check_shapes, check_twist
+from psd_deflection.model.plate.layout import bend, check_shapes, check_twist, tip_boxes
 from psd_deflection.model.plate.linear import condition_number, design_matrix, error_bound, gain_matrix
 from psd_deflection.model.plate.plate import (
     Tilts,
@@ -29,9 +29,8 @@ from psd_deflection.model.plate.plate import (
     tied_pose,
 )
 from psd_deflection.model.plate.rays import hit, lifted, rotation
-from psd_deflection.model.plate.scene import bend, tip_boxes
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.thesis.appendix_d_least_squares import printed_design_matrix
+from psd_deflection.studies.thesis.appendix_d import printed_design_matrix
 from psd_deflection.studies.thesis.comparison import DIRECT, SIDEBAR, printed_bound
 
 POSES = np.random.default_rng(5).normal(size=(6, 5)) * [0.003, 0.003, 0.05, 0.02, 0.02]

@@ -15,8 +15,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.measure.correction import Correction
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.plate import Geometry
-from psd_deflection.model.simulation.optics import dots_on_plate
-from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.physics import Physics, dots_on_plate
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.config import load_rig

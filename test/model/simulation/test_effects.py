@@ -18,7 +18,7 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, effects_to_values, sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.model.simulation.hysteresis import play
+from psd_deflection.model.simulation.law_forms import play
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray, RawChunk, TipLoad

@@ -17,7 +17,7 @@ from psd_deflection.model.solvers import SOLVERS, registry
 from psd_deflection.model.solvers.registry import Entry, check_live, solver_class
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.run.session import Session
-from psd_deflection.studies.budget.estimate import METHODS
+from psd_deflection.studies.budget.chain import METHODS
 
 BAG = Path(__file__).parents[3] / 'bags' / 'clean'
 

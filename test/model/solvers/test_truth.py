@@ -16,7 +16,7 @@ import pytest
 from psd_deflection.base.errors import SolverError
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import SolverStatus, make_solver
-from psd_deflection.model.solvers.one_psd import OnePsd
+from psd_deflection.model.solvers.subset import OnePsd
 from psd_deflection.rig.config import load_rig
 
 Array = np.ndarray[Any, Any]

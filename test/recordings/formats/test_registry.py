@@ -13,7 +13,7 @@ import pytest
 import psd_deflection as pd
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.formats.registry import (
+from psd_deflection.recordings.formats.format import (
     FORMATS,
     GROUP,
     endings_of_recordings,
@@ -25,7 +25,7 @@ from psd_deflection.recordings.read.references import read_references
 from psd_deflection.recordings.write.sinks import open_reference_file, open_sink
 from psd_deflection.records import ReferenceWithCovariance, SampleBlock
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.fleet.listing import listed
+from psd_deflection.run.fleet.tasks import listed
 from test.plug_in import install_plug_in
 from test.recordings.making import run
 

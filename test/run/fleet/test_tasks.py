@@ -15,9 +15,17 @@ import pytest
 from bench.campaign.mortal import dies, length
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, DaemonError, RecordingError, UsageError
-from psd_deflection.run.fleet.engines import check_engine, open_engine
-from psd_deflection.run.fleet.listing import LARGEST_LIST, is_plain, listed
-from psd_deflection.run.fleet.tasks import AHEAD, Outcome, attempt, outcomes
+from psd_deflection.run.fleet.tasks import (
+    AHEAD,
+    LARGEST_LIST,
+    Outcome,
+    attempt,
+    check_engine,
+    is_plain,
+    listed,
+    open_engine,
+    outcomes,
+)
 
 T = TypeVar('T')
 NAMES = ['a', 'bbb', 'rejected', 'cc', 'defect', 'dddd']
@@ -168,7 +176,7 @@ def test_encryption_without_certificates_is_rejected() -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('psd_deflection.run.fleet.engines.CONNECT_S', 0.2)
+    monkeypatch.setattr('psd_deflection.run.fleet.tasks.CONNECT_S', 0.2)
     # Nothing listens on the port of tcpmux.
     with (
         pytest.raises(DaemonError, match=r'^dask://127\.0\.0\.1:1: no Dask scheduler answers'),

@@ -23,9 +23,8 @@ from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import RESTART, AppliedLoad, BlockStatus, Mark, ParameterChange, ReferencePose
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import server
-from psd_deflection.run.monitor.access import is_loopback, is_own_host, is_own_page, is_token
 from psd_deflection.run.monitor.feed import Feed
-from psd_deflection.run.monitor.gated import CONNECTIONS, VIEWERS
+from psd_deflection.run.monitor.gated import CONNECTIONS, VIEWERS, is_loopback, is_own_host, is_own_page, is_token
 from psd_deflection.run.monitor.served import need_server
 from psd_deflection.run.monitor.server import MonitorServer
 from test.heard import WAIT_S

@@ -22,7 +22,7 @@ from psd_deflection.model.misalignment.model import ALL, INDEX, readings
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.budget import from_calibration
+from psd_deflection.studies.budget import certificate_page
 from psd_deflection.studies.budget.certificate import (
     Certificate,
     CertificateProblem,
@@ -30,8 +30,7 @@ from psd_deflection.studies.budget.certificate import (
     default_poses,
     verdict_of,
 )
-from psd_deflection.studies.budget.certificate_page import Certified
-from psd_deflection.studies.budget.from_calibration import read_calibration, read_fields
+from psd_deflection.studies.budget.certificate_page import Certified, read_calibration, read_fields
 from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, read_inputs
 
 EVERY = (*INPUTS, *REFERENCE_INPUTS)
@@ -418,10 +417,10 @@ def test_a_file_that_is_too_long_or_not_there_is_rejected(tmp_path: Path, monkey
     folder = _folder(tmp_path, _tree())
     size = (folder / 'calibration.json').stat().st_size
     # One of thirty parameters has 40 kB.
-    assert 40_000 < from_calibration.LONGEST == 10**7
-    monkeypatch.setattr(from_calibration, 'LONGEST', size)
+    assert 40_000 < certificate_page.LONGEST == 10**7
+    monkeypatch.setattr(certificate_page, 'LONGEST', size)
     assert read_calibration(folder)[1] == _tree()
-    monkeypatch.setattr(from_calibration, 'LONGEST', size - 1)
+    monkeypatch.setattr(certificate_page, 'LONGEST', size - 1)
     with pytest.raises(ConfigError, match=f'more than {size - 1} bytes'):
         read_calibration(folder)
     (folder / 'calibration.json').unlink()

@@ -18,10 +18,8 @@ from psd_deflection.model.misalignment.model import readings
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.budget.chain import MeasuringChain, dots, measure
-from psd_deflection.studies.budget.computation import COMPUTATION, perfect_answer
-from psd_deflection.studies.budget.estimate import ExactEstimator, estimator_of
-from psd_deflection.studies.budget.evaluate import CAUSES, draws, monte_carlo
+from psd_deflection.studies.budget.chain import ExactEstimator, MeasuringChain, dots, estimator_of, measure
+from psd_deflection.studies.budget.evaluate import CAUSES, COMPUTATION, draws, monte_carlo, perfect_answer
 from psd_deflection.studies.budget.inputs import read_inputs
 from psd_deflection.studies.budget.installation import BRACKET_EXPANSION, PLANE_TILT, SLOPE_RATIO
 from psd_deflection.studies.budget.term import Situation, Term

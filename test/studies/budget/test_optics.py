@@ -10,10 +10,9 @@ import pytest
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.budget.budget import BudgetProblem, budget
-from psd_deflection.studies.budget.environment import averaging_gain
-from psd_deflection.studies.budget.load import default_load
-from psd_deflection.studies.budget.optics import (
+from psd_deflection.studies.budget.budget import BudgetProblem, budget, default_load
+from psd_deflection.studies.budget.installation import averaging_gain
+from psd_deflection.studies.budget.sensor import (
     air_index,
     boundary_shift,
     gradient_shift,

@@ -14,14 +14,16 @@ import pytest
 
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.budget.budget import BudgetProblem, budget
-from psd_deflection.studies.budget.evaluate import CAUSES, draws, monte_carlo
-from psd_deflection.studies.budget.expanded import (
+from psd_deflection.studies.budget.evaluate import (
+    CAUSES,
     Interval,
     coverage_factor,
     difference,
+    draws,
     effective_freedom,
     expanded,
     interval_of,
+    monte_carlo,
 )
 from psd_deflection.studies.budget.inputs import read_inputs
 from psd_deflection.studies.budget.result import Budgeted, in_words, type_of

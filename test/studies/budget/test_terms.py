@@ -16,10 +16,8 @@ import pytest
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.budget.chain import MeasuringChain, dots, measure
-from psd_deflection.studies.budget.computation import COMPUTATION, stop_window
-from psd_deflection.studies.budget.estimate import estimator_of
-from psd_deflection.studies.budget.evaluate import CAUSES, evaluate, monte_carlo
+from psd_deflection.studies.budget.chain import MeasuringChain, dots, estimator_of, measure
+from psd_deflection.studies.budget.evaluate import CAUSES, COMPUTATION, evaluate, monte_carlo, stop_window
 from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
 from psd_deflection.studies.budget.installation import PLANE_TILT
 from psd_deflection.studies.budget.sensor import AMPLIFIER_NOISE

@@ -23,8 +23,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import read_parameter_file
-from psd_deflection.studies.check.checkup import check, of_recording
-from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check.checkup import check, of_recording, responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
 from psd_deflection.studies.discover.from_recordings import read_observation
 

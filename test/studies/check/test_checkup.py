@@ -15,8 +15,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.checkup import CheckProblem, check
-from psd_deflection.studies.check.levels import Levels
-from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup, Levels
 from psd_deflection.studies.check.wirings import PushResponse, on_channels
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 

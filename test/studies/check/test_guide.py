@@ -16,8 +16,7 @@ from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.guide import Guide, Phase, directions
-from psd_deflection.studies.check.levels import levels
-from psd_deflection.studies.check.result import RIGHT, WRONG, Checkup
+from psd_deflection.studies.check.result import RIGHT, WRONG, Checkup, levels
 from psd_deflection.studies.check.wirings import WIRINGS, parameters
 
 BLOCK = 20

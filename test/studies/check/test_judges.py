@@ -16,7 +16,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.studies.check import shared_findings
 from psd_deflection.studies.check.checkup import check, of_recording
-from psd_deflection.studies.check.levels import levels
+from psd_deflection.studies.check.result import levels
 
 RIG = load_rig()
 

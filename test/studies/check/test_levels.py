@@ -14,9 +14,9 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check import levels as module
-from psd_deflection.studies.check.levels import levels
-from psd_deflection.studies.check.responses import responses
+from psd_deflection.studies.check import result as module
+from psd_deflection.studies.check.checkup import responses
+from psd_deflection.studies.check.result import levels
 from psd_deflection.studies.check.wirings import (
     Difference,
     PushResponse,

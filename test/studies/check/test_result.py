@@ -12,7 +12,6 @@ import pytest
 
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.levels import Levels
 from psd_deflection.studies.check.result import (
     CANNOT_TELL,
     RIGHT,
@@ -20,6 +19,7 @@ from psd_deflection.studies.check.result import (
     WRONG,
     Checkup,
     Finding,
+    Levels,
     finding_tree,
     level_rows,
     other_causes,

@@ -25,19 +25,17 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover import planning, trees
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
-from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.hidden import beginning, mistakes, only_in
+from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.planning import Discrimination, Plan, Suggestion
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
-from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.fit import Fit, HeldOut
 from psd_deflection.studies.discover.search.localise import Cell, Dependence, Localisation
-from psd_deflection.studies.discover.search.screen import promising
-from psd_deflection.studies.discover.search.signatures import Candidate, candidates, signature_columns
+from psd_deflection.studies.discover.search.screen import Candidate, candidates, promising, signature_columns
 from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, Unknown, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
-from psd_deflection.studies.discover.setup.setup import finding_of_effect, likely_delays, likely_jumps
+from psd_deflection.studies.discover.setup import finding_of_effect, likely_delays, likely_jumps
 
 from .test_formulas import RIG, make_observation
 

@@ -15,18 +15,17 @@ import pytest
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import flat_parameters
-from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.free_loads import refitted
+from psd_deflection.studies.discover.applied import ringing_on, unseen
+from psd_deflection.studies.discover.discover import discover, refitted
+from psd_deflection.studies.discover.hidden import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.redundant import excess
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.free import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.applied import ringing_on, unseen
-from psd_deflection.studies.discover.setup.redundant import excess
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, read
 

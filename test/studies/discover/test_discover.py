@@ -26,10 +26,9 @@ from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.check.result import NAMES, Finding
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.screen import solve_observable
-from psd_deflection.studies.discover.search.signatures import SignatureBank
+from psd_deflection.studies.discover.search.screen import SignatureBank, solve_observable
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.study import described
 

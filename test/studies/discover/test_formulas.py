@@ -20,13 +20,13 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover import experiment
+from psd_deflection.studies.discover.cleaning import clean, stuck
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
+from psd_deflection.studies.discover.noise import NoiseModel, rest_windows, strip_lines
 from psd_deflection.studies.discover.observation import Observation, load_cases
+from psd_deflection.studies.discover.search.comparison import energies, gain_beyond
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.trust import energies, gain_beyond
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean, stuck
-from psd_deflection.studies.discover.setup.noise import NoiseModel, rest_windows, strip_lines
 
 RIG = load_rig()
 PUSHES = [(0.0, 0.0, 0.0), (5.0, -20.0, -9.0), (-10.0, 10.0, 12.0), (0.0, 0.0, 0.0)]

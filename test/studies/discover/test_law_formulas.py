@@ -17,10 +17,9 @@ from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import TARGETS, Law, LawTerm, effect_of, values_of, variables_of
 from psd_deflection.records import CHANNELS
-from psd_deflection.studies.discover.laws import law_features, laws, variance
-from psd_deflection.studies.discover.laws.law_features import responses, score, switchings, terms
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import heldout_gap
+from psd_deflection.studies.discover import law_features, laws
+from psd_deflection.studies.discover.law_features import responses, score, switchings, terms
+from psd_deflection.studies.discover.search.fit import Fit, heldout_gap, refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
 from .test_formulas import RIG, make_observation
@@ -296,19 +295,19 @@ def test_variances_are_the_likeliest() -> None:
     rng = np.random.default_rng(3)
     v2 = rng.uniform(0.0, 1.0, 4000)
     squares = (1.0 + 0.7 * v2) * rng.standard_normal(4000) ** 2
-    a, b = variance.variance(squares, v2)
+    a, b = law_features.variance(squares, v2)
 
     def likelihood(a: float, b: float) -> float:
         return float(sum(-math.log(a + b * v) - s / (a + b * v) for s, v in zip(squares, v2, strict=True)))
 
-    assert variance.likelihood(squares, a + b * v2) == pytest.approx(likelihood(a, b))
-    assert variance.likelihood(squares, 2.0) == pytest.approx(likelihood(2.0, 0.0))
+    assert law_features.likelihood(squares, a + b * v2) == pytest.approx(likelihood(a, b))
+    assert law_features.likelihood(squares, 2.0) == pytest.approx(likelihood(2.0, 0.0))
     here = likelihood(a, b)
     for da, db in ((0.02, 0.0), (-0.02, 0.0), (0.0, 0.04), (0.0, -0.04)):
         assert likelihood(a + da, b + db) < here
     # Noise does not grow negative, nor vanish.
-    assert variance.variance(squares, 1.0 - v2)[1] == 0.0
-    assert variance.variance(np.full(10, 1e-6), np.linspace(0.0, 1.0, 10)) == pytest.approx((0.05, 0.0), abs=1e-9)
+    assert law_features.variance(squares, 1.0 - v2)[1] == 0.0
+    assert law_features.variance(np.full(10, 1e-6), np.linspace(0.0, 1.0, 10)) == pytest.approx((0.05, 0.0), abs=1e-9)
 
 
 def test_noise_growing_with_load_has_size_and_evidence() -> None:
@@ -327,8 +326,8 @@ def test_noise_growing_with_load_has_size_and_evidence() -> None:
     assert term.of in (('load_fy',), ('y1',), ('y2',), ('dy',))
     squares = workspace.split(fit.residual)[0][4] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
-    a, b = variance.variance(squares, known**2 / (known**2).max())
-    gain = variance.likelihood(squares, a + b * known**2 / (known**2).max()) - variance.likelihood(
+    a, b = law_features.variance(squares, known**2 / (known**2).max())
+    gain = law_features.likelihood(squares, a + b * known**2 / (known**2).max()) - law_features.likelihood(
         squares, squares.mean()
     )
     assert found.delta_bic == pytest.approx(gain - 3.0, rel=1e-9)
@@ -341,9 +340,11 @@ def test_noise_growing_with_load_has_size_and_evidence() -> None:
     fold = np.concatenate([workspace.folds()[case] for case in workspace.case])
     v2, want = known**2 / (known**2).max(), 0.0
     for k in set(fold.tolist()):
-        a, b = variance.variance(squares[fold != k], v2[fold != k])
+        a, b = law_features.variance(squares[fold != k], v2[fold != k])
         own = squares[fold == k]
-        want += variance.likelihood(own, a + b * v2[fold == k]) - variance.likelihood(own, squares[fold != k].mean())
+        want += law_features.likelihood(own, a + b * v2[fold == k]) - law_features.likelihood(
+            own, squares[fold != k].mean()
+        )
     assert found.heldout.gain == pytest.approx(0.5 * want, rel=1e-9)
     assert found.laws == (found.law,)
     assert [law.stage for law in found.equivalent] == ['psd']

@@ -27,7 +27,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.conclusion import RigConclusion
-from psd_deflection.studies.discover.laws.laws import find_jitter, find_law
+from psd_deflection.studies.discover.laws import find_jitter, find_law
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.search.fit import refit

@@ -17,19 +17,21 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, Ef
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
-from psd_deflection.studies.discover import conclusion, readings
-from psd_deflection.studies.discover.laws import law_features, laws, variance
-from psd_deflection.studies.discover.search import coincidence, localise, proposals, weighing
-from psd_deflection.studies.discover.search import hold_out as validate
-from psd_deflection.studies.discover.search.coincidence import coincidences
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover import conclusion, law_features, laws, plants, setup
+from psd_deflection.studies.discover.search import fit as validate
+from psd_deflection.studies.discover.search import localise, proposals, weighing
+from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
+from psd_deflection.studies.discover.search.screen import Candidate
 from psd_deflection.studies.discover.search.search import SearchResult
-from psd_deflection.studies.discover.search.signatures import Candidate
-from psd_deflection.studies.discover.search.ties import CommonCause, Tie, ties
-from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect
+from psd_deflection.studies.discover.search.weighing import (
+    Alternative,
+    CommonCause,
+    NamedEffect,
+    Tie,
+    coincidences,
+    ties,
+)
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup import setup
 
 from .test_formulas import RIG, make_observation
 from .test_rules import A, Plant, active, noise, pictures
@@ -70,7 +72,7 @@ def test_noise_of_a_sum_is_no_gap() -> None:
     (term,) = found.law.terms
     squares = workspace.split(fit.residual)[0][5] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
-    _, b = variance.variance(squares, known**2 / (known**2).max())
+    _, b = law_features.variance(squares, known**2 / (known**2).max())
     # Volts: no sensitivity is in it.
     scale = workspace.noise[0].innovation[5] * 2.0
     assert term.coefficient == pytest.approx(math.sqrt(b / (known**2).max()) * scale, rel=1e-9)
@@ -129,7 +131,7 @@ def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
         EffectParameter('with_it', '', -9.0, 9.0, 1.0, '', kind='coupled'),
     )
     effect = Effect('made_up', 'psd', '', '', '', '', parameters, 'dots', apply=lambda *_: None)
-    got = readings.with_first_dose(effect, {p.name: p.nominal for p in parameters})
+    got = plants.with_first_dose(effect, {p.name: p.nominal for p in parameters})
     want = {'plain': 0.6, 'near': 0.55, 'listed': 0.4, 'far': 1.0, 'shape': 2.0, 'alone': 5.0, 'with_it': 1.0}
     assert got == pytest.approx(want)
 
@@ -149,7 +151,7 @@ def test_localisation_is_independent_of_fit_units() -> None:
 
 @pytest.mark.parametrize(('gains', 'share'), [((-5.0, 1.0), 0.0), ((3.0, 2.0), 0.5), ((30.0, 2.0), 1.0)])
 def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float], share: float) -> None:
-    tie = coincidence.Coincidence(((0, 'x'), (1, 'x')), (1.0, 1.0), 'V', 50.0)
+    tie = weighing.Coincidence(((0, 'x'), (1, 'x')), (1.0, 1.0), 'V', 50.0)
     fit = SimpleNamespace(effects=(active('a', x=1.0), active('b', x=1.0)), chi2=90.0)
     found = SimpleNamespace(delta_chi2=list(gains), null=SimpleNamespace(chi2=100.0))
     (unknown,) = weighing.tied(
@@ -187,11 +189,11 @@ def test_variable_is_known_as_means_of_estimate_blocks() -> None:
 @pytest.mark.parametrize(('nominal', 'choices', 'kept'), [(1.0, (0, 1), 1), (0.0, (0, 1), 0), (5.0, (2, 3), 2)])
 def test_a_choice_that_makes_no_difference_stays_as_it_is(nominal: float, choices: tuple[int, ...], kept: int) -> None:
     way = EffectParameter('way', '', 0, 9, 1, '', nominal=nominal, kind='choice', choices=choices)
-    assert readings.fixed_choice(way).choices == (kept,)
+    assert plants.fixed_choice(way).choices == (kept,)
     psd = dataclasses.replace(way, each=True)
     size = EffectParameter('size', 'V', -1.0, 1.0, 0.1, '')
-    assert readings.fixed_choice(psd) is psd
-    assert readings.fixed_choice(size) is size
+    assert plants.fixed_choice(psd) is psd
+    assert plants.fixed_choice(size) is size
 
 
 def test_the_nuisance_takes_part_in_no_tie() -> None:
@@ -201,7 +203,7 @@ def test_the_nuisance_takes_part_in_no_tie() -> None:
     beside = active('n', -9.0, 9.0, x=1.0)
     for free in (((-1, 'x'), (0, 'x'), (1, 'x')), ((0, 'x'), (-1, 'x'), (1, 'x'))):
         fit = Fit(effects, 0.0, np.zeros(200), [], jacobian, free, (), (beside,))
-        (tie,) = coincidence.coincidences(fit, Physics.of(RIG))
+        (tie,) = weighing.coincidences(fit, Physics.of(RIG))
         assert tie.members == ((0, 'x'), (1, 'x'))
 
 

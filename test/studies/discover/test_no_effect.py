@@ -23,13 +23,12 @@ from psd_deflection.recordings.replay.engine import zero_variances_at_end
 from psd_deflection.records import DOT_CHANNELS, FloatArray, ParameterChange
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.noise import NoiseModel, SlowNoise, block_factor, corners_of
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.recorded import Recorded, with_free
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.noise import NoiseModel
-from psd_deflection.studies.discover.setup.slow_noise import SlowNoise, block_factor, corners_of
 
 RIG = load_rig()
 PERIOD = 0.004

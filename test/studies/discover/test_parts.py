@@ -15,19 +15,18 @@ from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
+from psd_deflection.studies.discover import cleaning
+from psd_deflection.studies.discover.hidden import FIRST, LoadDirection, ZeroDirection
+from psd_deflection.studies.discover.noise import estimate_noise
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.search import localise, proposals
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.free import LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.weighing import Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup import cleaning
-from psd_deflection.studies.discover.setup.hidden import FIRST
-from psd_deflection.studies.discover.setup.noise import estimate_noise
 from psd_deflection.studies.discover.steps import (
     alternatives,
     fields_of,
@@ -38,7 +37,7 @@ from psd_deflection.studies.discover.steps import (
     where,
     without_effect,
 )
-from psd_deflection.studies.loads.fine import fine_means
+from psd_deflection.studies.loads.plate_motion import fine_means
 
 from .test_formulas import RIG, make_observation
 from .test_rules import FINE, A, B, Lone, Plant, candidate, noise, nowhere, pictures, without_noise

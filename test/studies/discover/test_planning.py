@@ -19,12 +19,12 @@ import pytest
 from scipy.stats import chi2
 
 from psd_deflection.base.errors import RecordingError, UsageError
-from psd_deflection.cli._next import how, limits_from_words
 from psd_deflection.cli.main import main
+from psd_deflection.cli.studies.discover import how_to_record, limits_from_words
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import effect_names, make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.model.simulation.loads import load_history
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
@@ -35,10 +35,10 @@ from psd_deflection.studies.discover.from_recordings import read_observations
 from psd_deflection.studies.discover.isolable import Isolability, Isolable, isolable
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import SEPARATES, Plan, plan_next
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.loads.fine import fine_means
+from psd_deflection.studies.loads.plate_motion import fine_means
 
 RIG = load_rig()
 EI = make_active('bending_stiffness', {'scale': -0.002, 'moves_frequency': 0}, 'test')
@@ -247,7 +247,7 @@ def test_a_plan_is_written_as_files_that_the_commands_take(
     files = loop.LoopResult(cast(Discovery, Nothing()), (), warm, None).files()
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    lines = how(warm, tmp_path)
+    lines = how_to_record(warm, tmp_path)
     script = load_history(str(tmp_path / 'next_loads.csv'), 1000.0).loads
     assert np.array_equal(script, plan.loads)
     command = shlex.split(lines[1])

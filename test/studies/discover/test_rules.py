@@ -26,23 +26,20 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover import experiment, planning
+from psd_deflection.studies.discover.noise import NoiseModel, estimate_noise
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Machine, Problem
-from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap, heldout_residual
+from psd_deflection.studies.discover.search.fit import Fit, HeldOut, heldout_gain, heldout_gap, heldout_residual, refit
 from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation, dependences, regressors
-from psd_deflection.studies.discover.search.remainder import Table
-from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
-from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.smooth import Table
 from psd_deflection.studies.discover.search.trials import wald_chi_square
-from psd_deflection.studies.discover.search.weighing import covariance_of, unknown_of
+from psd_deflection.studies.discover.search.weighing import coincidences, covariance_of, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 from psd_deflection.studies.discover.steps import accepted, alternatives, credible
-from psd_deflection.studies.loads.fine import fine_means
+from psd_deflection.studies.loads.plate_motion import fine_means
 
 RIG = load_rig()
 SIGMA = 1e-3

@@ -18,13 +18,13 @@ from psd_deflection.model.simulation.catalogue import effect_names
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.discover.cleaning import clean, outliers
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.from_recordings import read_observation
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean, outliers
-from psd_deflection.studies.discover.setup.setup import correct_wiring, likely_delays, likely_jumps
+from psd_deflection.studies.discover.setup import correct_wiring, likely_delays, likely_jumps
 
 RIG = load_rig()
 PUSHES = [(0.0, -40.0, -15.0), (0.0, -40.0, 0.0), (25.0, 0.0, 0.0), (0.0, 15.0, 20.0)]

@@ -20,17 +20,14 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.search import search as steps
-from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut
+from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
 from psd_deflection.studies.discover.search.localise import dependences, localise, regressors
-from psd_deflection.studies.discover.search.mistakes import mistake
-from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.screen import Candidate, Screen
+from psd_deflection.studies.discover.search.search import Search, mistake
+from psd_deflection.studies.discover.search.weighing import coincidences
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.setup import correct_wiring, load_sizes, movement_sums, noise_energy
+from psd_deflection.studies.discover.setup import correct_wiring, load_sizes, movement_sums, noise_energy
 from psd_deflection.studies.discover.steps import alternatives
 
 from .test_formulas import RIG, make_observation

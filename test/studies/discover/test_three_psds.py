@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.model.simulation.catalogue import catalogue, make_active
-from psd_deflection.model.simulation.effect_words import with_effects
+from psd_deflection.model.simulation.catalogue import catalogue, make_active, with_effects
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import channel_names, dot_names
 from psd_deflection.rig.config import Rig, load_rig, replace_values
@@ -22,9 +21,9 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.redundant import fourth, fourth_reading
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.redundant import fourth, fourth_reading
-from psd_deflection.studies.discover.setup.setup import correct_wiring
+from psd_deflection.studies.discover.setup import correct_wiring
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
 
 TWO = load_rig()

@@ -13,9 +13,9 @@ import pytest
 from blind.modes import RATE
 from psd_deflection.arms.shapers import recommended, shaper
 from psd_deflection.cli.main import main
-from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.result import Identified
+from psd_deflection.studies.identify.identify import Identified
+from psd_deflection.studies.identify.spectra import AxisModes, Mode
 from psd_deflection.studies.study import Opened, opened
 
 

@@ -14,13 +14,14 @@ from scipy.signal import lfilter, welch
 from scipy.signal.windows import hann
 
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.identify import operation
-from psd_deflection.studies.identify.operation import mode_in_operation, scatters_as_exponential
+from psd_deflection.studies.identify import spectra
 from psd_deflection.studies.identify.spectra import (
     ColouredNoise,
     coloured_noise,
     exceeds_noise,
     loudest_peak,
+    mode_in_operation,
+    scatters_as_exponential,
     white_noise,
 )
 
@@ -168,7 +169,7 @@ def test_mode_is_likeliest_with_scatter_of_likelihood(
         # What is said of it.
         prior = 1.0
     else:
-        monkeypatch.setattr(operation, 'SLOPE_SD', prior)
+        monkeypatch.setattr(spectra, 'SLOPE_SD', prior)
     samples = driven(noise=3e-5) + 1e-3 * np.arange(6000) / 6000.0 + 5e-3
     f, p = lines(samples, guess)
 

@@ -14,13 +14,16 @@ from scipy.optimize import brentq
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.loads import sway
-from psd_deflection.studies.loads.annotated_times import correct_loads
-from psd_deflection.studies.loads.effective import effective_loads
-from psd_deflection.studies.loads.load_cell import MeasuredLoad, without_cell_noise
+from psd_deflection.studies.loads import effective
+from psd_deflection.studies.loads.annotated_times import MeasuredLoad, correct_loads, without_cell_noise
+from psd_deflection.studies.loads.effective import (
+    SwayingLoad,
+    effective_loads,
+    excluded,
+    swaying_loads,
+    unannotated_times,
+)
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, implied_beside_rig, plateaus
-from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
-from psd_deflection.studies.loads.unannotated import unannotated_times
 from test.studies.held_loads import DWELL, HELD, RIG, T, answers, read
 
 
@@ -62,8 +65,8 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
     assert found.swung is not None
     true = (swung(force, frequency, axis) - HELD)[3 * DWELL : 4 * DWELL]
     assert np.abs(found.swung - true).max() < 0.03 * force
-    assert sway.swung(len(HELD), []) is None
-    every = sway.swung(len(HELD), [found])
+    assert effective.swung(len(HELD), []) is None
+    every = effective.swung(len(HELD), [found])
     assert every is not None
     np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], found.swung)
 
@@ -77,7 +80,7 @@ def test_apparent_step_excludes_sway_from_its_start() -> None:
         dataclasses.replace(annotated[3], first=cut, unannotated=True),
         *annotated[4:],
     ]
-    (found,) = sway.swaying(asked(pieces), annotated, asked, 1e-3)
+    (found,) = effective.swaying(asked(pieces), annotated, asked, 1e-3)
     assert (found.plateau.first, found.plateau.last) == (3 * DWELL, 4 * DWELL)
 
 
@@ -106,11 +109,11 @@ def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
 def test_a_peak_is_the_vertex_of_a_log_parabola() -> None:
     f = np.array([0.5, 1.0, 1.5, 2.0])
     top = np.exp(-(((f - 1.1) / 0.4) ** 2))
-    assert sway.peak_frequency(f, top) == pytest.approx(1.1)
-    assert sway.peak_frequency(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
-    assert sway.peak_frequency(f, np.zeros(4)) == 0.0
-    assert sway.peak_frequency(f[:2], np.array([1.0, 3.0])) == 1.0
-    assert sway.peak_frequency(np.zeros(0), np.zeros(0)) == 0.0
+    assert effective.peak_frequency(f, top) == pytest.approx(1.1)
+    assert effective.peak_frequency(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
+    assert effective.peak_frequency(f, np.zeros(4)) == 0.0
+    assert effective.peak_frequency(f[:2], np.array([1.0, 3.0])) == 1.0
+    assert effective.peak_frequency(np.zeros(0), np.zeros(0)) == 0.0
 
 
 def test_a_swing_is_what_no_constant_load_explains() -> None:
@@ -123,7 +126,7 @@ def test_a_swing_is_what_no_constant_load_explains() -> None:
     rest[1, 3 * n // size : n] += 2e-5 * force.reshape(-1, size).mean(axis=1)
     none = np.zeros((6, 3))
     implied = PlateauLoads(held, none, rest, rest, rest[:1], none[:, 0], np.array([1e-5, 2e-5, 1e-4]), size)
-    (found,) = sway.swaying(implied, held, lambda _: implied, 1e-3)
+    (found,) = effective.swaying(implied, held, lambda _: implied, 1e-3)
     assert found.plateau is held[3]
     assert [found.frequency, found.force] == [pytest.approx(1.3, abs=0.01), pytest.approx(1.6, abs=0.1)]
     assert found.swung is not None
@@ -134,7 +137,7 @@ def test_a_swing_is_what_no_constant_load_explains() -> None:
     lost[:, n // size : 3 * n // size] = np.nan
     lost[1, n:] += 2e-6 * np.tile(force, 2).reshape(-1, size).mean(axis=1)
     implied = dataclasses.replace(implied, rest=lost)
-    assert [s.plateau for s in sway.swaying(implied, held, lambda _: implied, 1e-3)] == [held[3]]
+    assert [s.plateau for s in effective.swaying(implied, held, lambda _: implied, 1e-3)] == [held[3]]
 
 
 MANY_LEVELS = np.array(

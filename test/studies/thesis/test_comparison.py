@@ -17,18 +17,22 @@ from psd_deflection.base.errors import SolverError
 from psd_deflection.model.link.section import TubeSection
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers.registry import SOLVERS
+from psd_deflection.studies.thesis.appendix_d import compared, mismatch, tilt_branches
 from psd_deflection.studies.thesis.comparison import (
     CAUSES,
     CONDITIONS,
+    DIAMETERS,
+    FORCES,
     Method,
     dots_of,
     errors,
     methods,
     rejected,
+    spot_changes,
+    spot_run,
     table_5_1,
     thesis_geometry,
 )
-from psd_deflection.studies.thesis.large_spots import DIAMETERS, FORCES, spot_changes, spot_run
 from psd_deflection.studies.thesis.scaling import (
     BASE_SECTION,
     COLUMNS,
@@ -45,7 +49,6 @@ from psd_deflection.studies.thesis.scaling import (
     torsion_to_bending_ratio,
     torsion_to_bending_ratio_exact,
 )
-from psd_deflection.studies.thesis.tilt_compensation import compared, mismatch, tilt_branches
 
 Cell = tuple[float, float, float]
 

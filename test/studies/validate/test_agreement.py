@@ -14,10 +14,9 @@ from scipy.stats import linregress
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.validate.agreement import Agreement, agreement
-from psd_deflection.studies.validate.clock import Offset
+from psd_deflection.studies.validate.clock import Motion, Offset
 from psd_deflection.studies.validate.from_recordings import ValidateProblem
-from psd_deflection.studies.validate.motion import Motion
-from psd_deflection.studies.validate.result import Validated
+from psd_deflection.studies.validate.validate import Validated
 
 
 def test_bias_scale_and_noise_are_separated() -> None:

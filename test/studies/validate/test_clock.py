@@ -23,6 +23,7 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.validate import clock
 from psd_deflection.studies.validate.clock import (
+    Motion,
     Offset,
     OffsetFit,
     UsedReferences,
@@ -31,7 +32,6 @@ from psd_deflection.studies.validate.clock import (
     coarse_offsets,
     refined_offset,
 )
-from psd_deflection.studies.validate.motion import Motion
 
 
 def motion_of(run: ClockRecording, kept: Array | None = None) -> Motion:

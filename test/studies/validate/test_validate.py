@@ -23,8 +23,8 @@ from psd_deflection.records import FloatArray, Mark, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.study import Opened
 from psd_deflection.studies.validate import from_recordings as module
+from psd_deflection.studies.validate.clock import Motion
 from psd_deflection.studies.validate.from_recordings import ValidateProblem, read_validate
-from psd_deflection.studies.validate.motion import Motion
 from psd_deflection.studies.validate.validate import validate
 from test.altered import altered
 

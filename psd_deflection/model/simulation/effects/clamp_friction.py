@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
-from psd_deflection.model.simulation.hysteresis import play
+from psd_deflection.model.simulation.law_forms import play
 from psd_deflection.model.simulation.samples import SimulatedSamples
 
 _REST_BLOCKS = 12

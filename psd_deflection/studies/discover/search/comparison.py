@@ -212,3 +212,40 @@ class Comparison(ABC):
         """Whitened residual vector, and measured minus simulated."""
         difference = [m - s for m, s in zip(self.measured, self.simulate(effects), strict=True)]
         return self.whiten(difference), difference
+
+
+RELATIVE = 0.002
+"""Share of the explained movement, as an amplitude, by which the simulation may be wrong."""
+
+BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
+"""Edges, Hz; the last band has no upper end."""
+
+
+def energies(workspace: Comparison, vector: FloatArray) -> FloatArray:
+    """Chi-square of a whitened vector (D,) by recording, channel and band: (recordings, channels, bands)."""
+    out = []
+    for part, period in zip(workspace.split(vector), workspace.periods, strict=True):
+        n = part.shape[1]
+        power = np.abs(np.fft.rfft(part, axis=1)) ** 2 * (2.0 / n)
+        power[:, 0] *= 0.5
+        if n % 2 == 0:
+            power[:, -1] *= 0.5
+        starts = np.searchsorted(np.fft.rfftfreq(n, period), BANDS[:-1])
+        padded = np.concatenate((power, np.zeros((len(power), 1))), axis=1)
+        band = np.add.reduceat(padded, np.minimum(starts, power.shape[1]), axis=1)
+        # reduceat gives the element itself for a band without frequencies.
+        out.append(np.where(np.diff([*starts, power.shape[1]]) > 0, band, 0.0))
+    return np.stack(out)
+
+
+def gain_beyond(workspace: Comparison, smaller: FloatArray, larger: FloatArray, explained: FloatArray) -> float:
+    """Chi-square gained from residual ``smaller`` to residual ``larger`` (D,), whitened, beyond the simulation's error.
+
+    ``explained`` (D,): what the smaller model explains. A gain in a channel and band in which this error alone may give
+    as much does not count; a loss counts.
+    """
+    if not np.any(explained):
+        return float(smaller @ smaller - larger @ larger)
+    gain = energies(workspace, smaller) - energies(workspace, larger)
+    allowed = RELATIVE**2 * energies(workspace, explained)
+    return float(gain[(gain > allowed) | (gain < 0.0)].sum())

@@ -20,11 +20,10 @@ from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray, IntArray, channel_names
-from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.trust import BANDS, RELATIVE
+from psd_deflection.studies.discover.hidden import only_in
+from psd_deflection.studies.discover.search.comparison import BANDS, RELATIVE, Comparison
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import only_in
-from psd_deflection.studies.loads.fine import fine_means
+from psd_deflection.studies.loads.plate_motion import fine_means
 
 CLIP = 6.0
 """Whitened values are limited to this, so outliers of heavy-tailed noise do not count as structure."""

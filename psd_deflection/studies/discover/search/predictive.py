@@ -22,8 +22,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import STEP, Fit
-from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.trials import slot, unbound
 
 MOST_FOLDS = 11

@@ -6,21 +6,93 @@ unknown.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY, ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.planning import Suggestion
-from psd_deflection.studies.discover.search.coincidence import Coincidence
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.hold_out import HeldOut, scatter
+from psd_deflection.studies.discover.search.fit import Fit, HeldOut, scatter
 from psd_deflection.studies.discover.search.localise import Dependence, Localisation
 from psd_deflection.studies.discover.search.search import SearchResult
+
+DECADES = 2.0
+"""Range over which the ratio of two independent sizes is spread."""
+ODDS = 20.0
+"""Odds for one cause against independent effects, over all pairs or triples compared. By Markov's inequality,
+independent effects reach odds of N at most once in N searches.
+"""
+EXACT = 0.003
+"""Relative; no ratio is trusted to better, because a stand-in matches the true cause only approximately."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coincidence:
+    """Amplitudes of the fit, (index of the effect, parameter), whose ``sizes`` agree; ``odds`` for one cause."""
+
+    members: tuple[tuple[int, str], ...]
+    sizes: tuple[float, ...]
+    unit: str
+    odds: float
+
+
+def _amplitudes(fit: Fit, physics: Physics | None, covariance: FloatArray) -> list[tuple[int, float, str]]:
+    """Column, distance from off and unit of every amplitude that is significantly different from zero."""
+    out = []
+    for column, (i, name) in enumerate(fit.free):
+        if i < 0:
+            continue
+        p = fit.effects[i].effect.parameter(name)
+        size = fit.effects[i].values[name] - p.off(physics)
+        clear = abs(size) > 5.0 * math.sqrt(covariance[column, column])
+        if p.kind == 'amplitude' and clear and not fit.effects[i].effect.finite:
+            out.append((column, size, p.unit))
+    return out
+
+
+def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
+    """The ties between amplitudes of different effects of ``fit`` that are beyond chance, the strongest first."""
+    covariance = fit.covariance()
+    sizes = _amplitudes(fit, physics, covariance)
+    out = []
+    for count in (2, 3):
+        compared = [group for group in itertools.combinations(sizes, count) if _may_coincide(fit, group)]
+        for group in compared:
+            odds = _odds(group, covariance) / len(compared)
+            if odds >= ODDS:
+                members = tuple(fit.free[column] for column, _, _ in group)
+                out.append(Coincidence(members, tuple(size for _, size, _ in group), group[0][2], odds))
+    return sorted(out, key=lambda c: -c.odds)
+
+
+def _may_coincide(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
+    """Return whether these amplitudes are of different effects and of one unit, and no known cause ties them."""
+    effects = [fit.free[column][0] for column, _, _ in group]
+    # What ties two stiffnesses is known, and told by :mod:`.ties`.
+    stiff = [i for i in effects if MOVES_FREQUENCY in fit.effects[i].effect.parameters]
+    return len(set(effects)) == len(group) == len([g for g in group if g[2] == group[0][2]]) and len(stiff) < 2
+
+
+def _odds(group: Sequence[tuple[int, float, str]], covariance: FloatArray) -> float:
+    """Odds that the sizes of ``group`` are one against independent ones, of this group alone."""
+    columns, sizes = [g[0] for g in group], np.array([g[1] for g in group])
+    of_logs = covariance[np.ix_(columns, columns)] / np.outer(sizes, sizes)
+    # The logarithm of the first less those of the others.
+    less = np.column_stack((np.ones(len(group) - 1), -np.eye(len(group) - 1)))
+    size_covariance = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
+    off = less @ np.log(np.abs(sizes))
+    density = math.exp(-0.5 * float(off @ np.linalg.solve(size_covariance, off))) / math.sqrt(
+        np.linalg.det(2.0 * np.pi * size_covariance)
+    )
+    return float((DECADES * math.log(10.0)) ** len(off) * density)
+
 
 EQUIVALENT = 21.6
 """Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
@@ -251,3 +323,94 @@ def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Lo
 
 def _even(regressor: str) -> bool:
     return '^2' in regressor or '|' in regressor or regressor in ('constant', 'dot_x dot_y')
+
+
+SAME = 3.0
+"""Standard deviations of their difference up to which two shares count as the same."""
+CLEAR = 5.0
+"""Standard deviations that a share is away from none."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommonCause:
+    """``factor``: by what the rig's radii, or the annotated loads, would have to be multiplied; with ``sd``."""
+
+    name: str
+    factor: float
+    sd: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """``share``: by how much both stiffnesses differ from the rig file's, relative, with ``sd``; ``causes``: each
+    explains both. ``moves``: whether the natural frequencies moved with them.
+    """
+
+    share: float
+    sd: float
+    moves: bool
+    causes: tuple[CommonCause, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Why they are tied, the causes with their sizes, and what tells these apart."""
+        share_words = f'{100.0 * self.share:.3g} ± {100.0 * self.sd:.1g} %'
+        factors = {c.name: f'{c.factor:.5g} ± {c.sd:.1g}' for c in self.causes}
+        words = f'Both stiffnesses, EI and GJ, differ by the same share ({share_words}), as one cause makes them: '
+        radius = f"the link's radii times {factors['link_radius']} (EI and GJ grow with their fourth power)"
+        if self.moves:
+            return (
+                f'{words}{radius}, or its material (E and G alike). Not the loads: the natural frequencies moved too. '
+                f"Measure the link's diameter: that tells the radius from the material."
+            )
+        return (
+            f'{words}{radius}, its material (E and G alike), or the annotated loads times {factors["load_unit"]}. '
+            f"Static loads cannot tell these apart: measure the link's diameter, and weigh the loads."
+        )
+
+
+def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
+    """Return the tie of the two stiffnesses among ``effects`` and their alternatives, if they differ by the same
+    share.
+    """
+    for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
+        apart = SAME * math.hypot(first.sd, second.sd, EXACT * first.value)
+        clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CLEAR
+        same = first.moves == second.moves and abs(first.value - second.value) <= apart
+        if first.effect != second.effect and same and clear:
+            return (_tie(first.value, first.sd, second.value, second.sd, first.moves),)
+    return ()
+
+
+class _Share(NamedTuple):
+    """Relative change of a stiffness by an effect, with its sd; ``moves``: whether the mode moves with it."""
+
+    effect: str
+    value: float
+    sd: float
+    moves: bool
+
+
+def _shares(effects: Sequence[NamedEffect]) -> Iterator[_Share]:
+    """The changes of stiffnesses, wherever they are named or an alternative."""
+    for named in effects:
+        either: tuple[NamedEffect | Alternative, ...] = (named, *named.fitted_alternatives)
+        for e in either:
+            effect = e.active.effect
+            if MOVES_FREQUENCY not in effect.parameters:
+                continue
+            scale = next(p.name for p in effect.parameters if p.kind == 'amplitude')
+            sd = e.sd.get(scale, 0.0)
+            if sd > 0.0:
+                yield _Share(effect.name, e.active.values[scale], sd, bool(e.active.values[MOVES_FREQUENCY.name]))
+
+
+def _tie(a: float, sd_a: float, b: float, sd_b: float, moves: bool) -> Tie:
+    weight = sd_b**2 / (sd_a**2 + sd_b**2)
+    share = weight * a + (1.0 - weight) * b
+    sd = sd_a * sd_b / math.hypot(sd_a, sd_b)
+    radius = (1.0 + share) ** 0.25
+    causes = [CommonCause('link_radius', radius, 0.25 * radius / (1.0 + share) * sd)]
+    if not moves:
+        causes.append(CommonCause('load_unit', 1.0 / (1.0 + share), sd / (1.0 + share) ** 2))
+    return Tie(share, sd, moves, tuple(causes))

@@ -22,14 +22,20 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
+from psd_deflection.studies.discover.hidden import (
+    FIRST,
+    SETUP,
+    Direction,
+    Free,
+    LoadDirection,
+    added,
+    moved,
+    only_in,
+)
+from psd_deflection.studies.discover.noise import NoiseModel, corners_of, estimate_noise
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
-from psd_deflection.studies.discover.search.free import Direction, Free, LoadDirection, added, moved
-from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
-from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
-from psd_deflection.studies.discover.setup.slow_noise import corners_of
-from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
-from psd_deflection.studies.loads.plate_motion import dot_rows
+from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, dot_rows, fine_means
 
 LEAST_NOISE = 0.05
 """Share of the rig file's noise that is assumed at least."""
