@@ -176,6 +176,17 @@ def test_constant_time_and_huge_losses_take_no_room() -> None:
     assert 0 < found.columns['lost'][0] <= 5 * history.MOST_LOST
 
 
+def test_a_gap_has_no_value_and_loses_nothing() -> None:
+    made = filled(row(START_NS + s * SECOND, 1e-3, lost=1) for s in (*range(10), *range(70, 80)))
+    found = window(made, 0, 80).columns
+    there = np.repeat([1.0, 0.0, 1.0], [10, 60, 10])
+    np.testing.assert_array_equal(np.isfinite(found['dx']), there > 0.0)
+    for name in ('blocks', 'estimates', 'lost'):
+        np.testing.assert_array_equal(found[name], there)
+    # In cells wider than the gap it is not seen, but their count of blocks tells it.
+    assert window(made, 0, 80, 1).columns['blocks'].tolist() == [10, 10]
+
+
 def test_memory_is_taken_once_and_marks_are_bounded() -> None:
     made = filled([])
     before = made.bytes
@@ -187,7 +198,7 @@ def test_memory_is_taken_once_and_marks_are_bounded() -> None:
     content = json.loads(made.answer(history.Asked(START_NS, START_NS + SECOND, 100)))
     assert content['marks'][-1] == [history.MOST_MARKS + 699]
     assert len(content['marks']) == history.SENT_MARKS
-    assert content['marks_left_out'] == history.MOST_MARKS - history.SENT_MARKS
+    assert content['marks_left_out'] == 2000 - history.SENT_MARKS
 
 
 @pytest.mark.slow

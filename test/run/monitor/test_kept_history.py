@@ -149,7 +149,7 @@ def test_cells_and_marks_that_are_none_are_passed_over(file_of: Open, tmp_path: 
         own.execute("INSERT INTO marks VALUES (0, 'no JSON'), (1, '{}'), ('noon', '[1]')")
     kept = file.load(LATER, LATER)
     assert [int(k) for k in kept.cells['key']] == [key + 2, key + 3]
-    assert kept.marks == [(START_NS, '[1]')]
+    assert (kept.from_key, kept.marks) == (0, [(START_NS, '[1]')])
 
 
 class Keeping:
@@ -192,6 +192,7 @@ def test_nothing_is_saved_before_what_was_kept_is_read(keep: Callable[[], Keepin
     one.restored()
     one.saved()
     one.keeper.end()
+    assert not one.keeper.alive
     two = keep()
     two.restored()
     assert two.count() == 1
