@@ -31,7 +31,7 @@ from psd_deflection.studies.calibrate.fit import (
     prior_of_rig,
 )
 from psd_deflection.studies.calibrate.observation import Rows
-from psd_deflection.studies.calibrate.progress import CalibrationProgress, ParameterProgress, progress_of
+from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress, progress_of
 from psd_deflection.studies.calibrate.result import result
 from tools.program import ROOT
 
@@ -170,6 +170,29 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
 def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(left: float, determined: bool, filled: float) -> None:
     parameter = ParameterProgress(name='n', words='', value='', left=left, determined=determined)
     assert parameter.filled == pytest.approx(filled)
+
+
+def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
+    parameter = ParameterProgress(name='n', words='a', value='b', left=0.1, determined=True)
+    row = {**parameter._asdict(), 'filled': parameter.filled}
+    assert CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree() == {
+        'kind': 'reference',
+        'seconds': 2.0,
+        'determined': 1,
+        'rejected': 'too short',
+        'parameters': [row],
+        'needs': [{'motion': 'push', 'names': ('n',)}],
+    }
+
+
+def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
+    groups = [MovedGroup('psd_1.gain', 0.01, 3.0, 2, {'psd_1.gain_x': (0.02, 0.001)})]
+    found = checking.CalibrationCheck(False, 0.01, groups, ['psd_2.gain'], 1e-6 * np.arange(4), 1e-7 * np.ones(4))
+    tree = checking.result(found)
+    assert [*tree['zero']] == [f'psd_{psd}.zero_{axis}' for psd in (1, 2) for axis in 'xy']
+    assert [v['value'] for v in tree['zero'].values()] == [0.0, 1e-6, 2e-6, 3e-6]
+    assert (tree['verdict'], tree['moved'], tree['or']) == ('moved', 'psd_1.gain', ['psd_2.gain'])
+    assert tree['groups'][0]['shifts'] == {'psd_1.gain_x': {'value': 0.02, 'sd': 0.001}}
 
 
 def test_a_rejection_is_in_the_file_and_none_is_null() -> None:

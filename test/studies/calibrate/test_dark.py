@@ -83,6 +83,7 @@ def test_what_is_reported_of_one_psd(nominal: Rig) -> None:
     assert (tree['sum']['file'], tree['sum']['unit']) == (0.0, 'V')
     assert tree['recording'] == {'name': 'off.csv', 'sha256': 'ab' * 32}
     assert words_of_level(one).startswith('psd_1 with its laser off: sum 0.119')
+    assert ' % of the light pulls to (+1.50, -1.00) mm; what ' in words_of_level(one).replace('%', ' %')
     (alone, _) = dark_levels([run_of(darkness())], nominal)
     assert alone.lit_sum == pytest.approx(5.0 + alone.volts[2])
 

@@ -13,20 +13,27 @@ import pytest
 from scipy.optimize import minimize
 
 from blind import misaligned
+from psd_deflection.model.misalignment.model import COUNT, TOLERANCES, ZERO
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.studies.calibrate.fit import (
     CLAMP_AT,
     SIZE,
+    CalibrationFit,
     Kind,
     Linear,
     Noise,
     deviation_of,
+    fit,
+    linearised,
     pose_of_readings,
+    posterior,
     prior_of_rig,
+    score_at,
     variance_components,
     weight_matrices,
+    with_common_zero,
 )
 from psd_deflection.studies.calibrate.observation import (
     CALM_LEAST,
@@ -83,6 +90,70 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
     covariance = linear.pose_slopes[2] @ np.diag(noise.reference**2) @ linear.pose_slopes[2].T
     np.testing.assert_allclose(each[2], np.linalg.inv(covariance + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
     np.testing.assert_allclose(weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)
+
+
+def rows_of_two(offset: FloatArray) -> Rows:
+    """Two recordings of one rig; the readings of the second are off by ``offset`` (4,), m."""
+    rng, n = np.random.default_rng(8), 120
+    pose = rng.uniform(-1.0, 1.0, (n, 3)) * (3e-3, 3e-3, 2e-2)
+    run = np.repeat([0, 1], n // 2)
+    dots = misaligned.dots(misaligned.nominal(), pose) + 1e-6 * rng.normal(size=(n, 4)) + run[:, None] * offset
+    loads, velocity = rng.uniform(-10.0, 10.0, (n, 3)), rng.normal(size=(n, 3)) * 1e-3
+    pose += rng.normal(size=(n, 3)) * (2e-5, 2e-5, 2e-4)
+    moved, nothing = np.full((n, 4), 1e-12), np.zeros(n, dtype=bool)
+    return Rows(np.arange(n) * 0.1, run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3)))
+
+
+@pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
+def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: Kind) -> None:
+    """Score and information are those of dense least squares with four more unknowns, less those (Schur)."""
+    rows, rig = rows_of_two(np.full(4, 1e-4)), rig_from_values({})
+    prior, weights = prior_of_rig(rig), np.random.default_rng(1).uniform(0.1, 1.0, len(rows_of_two(np.zeros(4))))
+    noise, none = Noise(np.array([3e-5, 2e-5, 1e-4]), 1.5, 2.0), np.zeros((SIZE, SIZE))
+    linear = linearised(rows, prior.mean, rig, kind)
+    best = CalibrationFit(prior.mean, none, none, linear, weights, noise, np.ones(SIZE, dtype=bool))
+    score, information = score_at(rows, prior.mean, rig, kind, best)
+    normal, right = np.zeros((SIZE + 4, SIZE + 4)), np.zeros(SIZE + 4)
+    normal[SIZE:, SIZE:] = np.diag(TOLERANCES[ZERO:COUNT] ** -2)
+    for j in range(len(rows)):
+        slopes = np.hstack([linear.slopes[j], linear.slopes[j][:, ZERO:COUNT] * (rows.run[j] == 1)])
+        covariance = linear.pose_slopes[j] @ np.diag(noise.reference**2) @ linear.pose_slopes[j].T
+        inverse = weights[j] * np.linalg.inv(covariance + 1.5**2 * np.diag(rows.variances[j])) / 2.0
+        normal += slopes.T @ inverse @ slopes
+        right += slopes.T @ inverse @ linear.residual[j]
+    gain = normal[:SIZE, SIZE:] @ np.linalg.inv(normal[SIZE:, SIZE:])
+    size = np.sqrt(np.abs(np.diag(normal[:SIZE, :SIZE]))) + 1e-30
+    scale = np.outer(size, size)
+    np.testing.assert_allclose(
+        information / scale, (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale, atol=1e-8
+    )
+    reach = np.abs(right).max() + np.abs(right[:SIZE] / size).max() * size
+    np.testing.assert_allclose(score / reach, (right[:SIZE] - gain @ right[SIZE:]) / reach, atol=1e-8)
+
+
+def test_two_recordings_have_one_zero_after_the_offset_is_taken_off() -> None:
+    """A zero moves readings under load by nearly as much: what is left is the dots' noise and its mean's."""
+    offset, rig = np.array([4e-5, -3e-5, 2e-5, 5e-5]), rig_from_values({})
+    prior = prior_of_rig(rig)
+    free = np.zeros(SIZE, dtype=bool)
+    free[ZERO:COUNT] = True
+    rows, best = with_common_zero(rows_of_two(offset), rig, prior, 'reference', free)
+    np.testing.assert_allclose(rows.dots, rows_of_two(np.zeros(4)).dots, atol=6e-6)
+    assert best.noise.reference == pytest.approx([2e-5, 2e-5, 2e-4], rel=0.25)
+    assert best.noise.dots == pytest.approx(1.0, rel=0.25)
+    again = fit(rows, rig, prior, 'reference', free=free)
+    np.testing.assert_allclose(best.values[ZERO:COUNT], again.values[ZERO:COUNT], atol=1e-8)
+    np.testing.assert_allclose(best.covariance, posterior(best.information, prior, free), rtol=1e-9)
+    assert not np.any(best.values[:ZERO] - prior.mean[:ZERO])
+
+
+def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
+    free = np.zeros(SIZE, dtype=bool)
+    free[: ZERO // 2] = True
+    rig = rig_from_values({})
+    found = fit(rows_of_two(np.zeros(4)), rig, prior_of_rig(rig), 'self', free=free).noise
+    assert (found.reference.tolist(), found.fewer) == ([1.0, 1.0, 1.0], 1.0)
+    assert found.dots == pytest.approx(1.0, rel=0.15)
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
@@ -181,15 +252,10 @@ def test_the_noise_of_each_channel_is_found() -> None:
 
 
 def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
-    t = seconds(3000)
-    loads = np.zeros((3000, 3))
-    loads[1000:1500, 0] = 5.0
-    rest = at_rest(loads, t)
-    assert not rest[1000:1500].any()
-    assert np.flatnonzero(rest[:1000]).min() == pytest.approx(500, abs=1)
-    assert np.flatnonzero(rest[1500:]).min() == pytest.approx(750, abs=1)
-    assert rest[999]
-    assert rest[2999]
+    # The first hold is of 1024 steps of 1/1024 s, without a rounding; the second is too short, the third of 1499.
+    t, loads = seconds(3000, 1.0 / 1024.0), np.zeros((3000, 3))
+    loads[1025:1500, 0] = 5.0
+    assert np.flatnonzero(at_rest(loads, t)).tolist() == [*range(512, 1025), *range(2250, 3000)]
     assert not at_rest(None, t).any()
 
 
