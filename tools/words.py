@@ -10,43 +10,15 @@ from collections import Counter
 from pathlib import Path
 
 # The word that is no longer used, and what the field writes.
-FINISHED = {
-    'refused': 'rejected',
-    'refuse': 'reject',
-    'refuses': 'rejects',
-    'refusal': 'rejection',
-    'told': 'reported',
-    'tells': 'reports',
-    'seen': 'observed',
-    'said': 'message',
-    'hung': 'applied',
-    'noted': 'annotated',
-    'unnoted': 'unannotated',
-    'acted': 'effective',
-    'mended': 'corrected',
-    'wire': 'sink',
-    'wires': 'sinks',
-    'say': 'log',
-    'says': 'description',
-    'unsaid': 'significant',
-    'ear': 'probe',
-    'ears': 'probes',
-    'hear': 'feed',
-    'rival': 'alternative',
-    'rivals': 'alternatives',
-    'lattice': 'value_grid',
-    'gathered': 'buffered',
-    'foretold': 'predicted',
-    'coasts': 'predictions_only',
-    'suspect': 'candidate',
-    'suspects': 'candidates',
-    'judge': 'classify',
-    'judges': 'classifies',
-    'judged': 'classified',
-    'whole': 'full',
-    'freed': 'with_free',
-    'turned': 'rotated',
-}
+_WORDS = """
+refused:rejected refuse:reject refuses:rejects refusal:rejection told:reported tells:reports seen:observed
+said:message hung:applied noted:annotated unnoted:unannotated acted:effective mended:corrected wire:sink
+wires:sinks say:log says:description unsaid:significant ear:probe ears:probes hear:feed rival:alternative
+rivals:alternatives lattice:value_grid gathered:buffered foretold:predicted coasts:predictions_only
+suspect:candidate suspects:candidates judge:classify judges:classifies judged:classified whole:full
+freed:with_free turned:rotated
+"""
+FINISHED: dict[str, str] = dict(re.findall(r'(\w+):(\w+)', _WORDS))
 FOREIGN = {'ConnectionRefusedError'}  # Names of other people.
 # A test's name is a sentence in plain words.
 SENTENCE = re.compile('test_[a-z0-9]+_[a-z0-9]+_[a-z0-9_]+')
