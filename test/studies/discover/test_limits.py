@@ -145,6 +145,8 @@ def test_localisation_is_independent_of_fit_units() -> None:
     )
     assert one.p == pytest.approx(other.p)
     assert [d.gain for d in one.dependences] == pytest.approx([d.gain for d in other.dependences])
+    strong = {d.channel for d in one.dependences if d.p < 0.01}
+    assert {c.channel for c in one.cells if c.depends_on} <= strong < {c.channel for c in one.cells}
     # A column that is all of what noise draws leaves less of it.
     assert [c.p for c in one.cells] == pytest.approx([c.p for c in other.cells])
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.simulator import ForwardModel
@@ -203,6 +204,29 @@ def test_a_memory_is_observed_in_more_than_400_samples_at_rest(n: int, known: bo
     o = Observation('x', RIG, np.zeros((n, 6)), np.zeros((n, 3)))
     model = estimate_noise(o, resting(n, 1e-3, 0.8), 4, np.full(6, 1e-6))
     assert all(model.coloured) == any(model.coloured) == known
+
+
+@pytest.mark.parametrize(
+    ('errors', 'coloured'),
+    [((4.6, 3, 0, 0, 0, 0), 0), ((5.4, 3, 0, 0, 0, 0), 1), ((5.4, 5.4, 5.4, 5.4, 3, 1), 5)],
+)
+def test_a_weak_memory_counts_beside_clear_ones(errors: tuple[float, ...], coloured: int) -> None:
+    """A correlation of neighbours of five of its standard errors; of two, if most channels have that."""
+    n, rows = 4000, np.random.default_rng(1).standard_normal((4000, 6))
+    for c, wanted in enumerate(errors):
+        white = rows[:, c].copy()
+
+        def mixed(share: float, x: FloatArray = white) -> FloatArray:
+            return x + share * np.roll(x, 1)
+
+        def beyond(share: float, wanted: float = wanted) -> float:
+            x = mixed(share)
+            return float(x[1:] @ x[:-1] / (x @ x) * math.sqrt(n)) - wanted
+
+        rows[:, c] = mixed(brentq(beyond, -0.5, 0.5))
+    o = Observation('x', RIG, np.zeros((n, 6)), np.zeros((n, 3)))
+    model = estimate_noise(o, 1e-3 * rows, 4, np.full(6, 1e-6))
+    assert model.coloured == (True,) * coloured + (False,) * (6 - coloured)
 
 
 @pytest.mark.slow

@@ -135,7 +135,6 @@ def test_the_rig_files_effects_are_in_the_model() -> None:
     assert np.std(rows - 1e6 * table.values.T) < 1.2e6 * NOISE
 
 
-@pytest.mark.slow
 def test_a_mass_is_a_weight_and_an_arm_its_torque(tmp_path: Path) -> None:
     path = tmp_path / 'hung.csv'
     path.write_text(

@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.problem import Machine, Problem
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut, heldout_gain, heldout_gap, heldout_residual, refit
 from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation, dependences, regressors
-from psd_deflection.studies.discover.search.screen import Candidate, Screen
+from psd_deflection.studies.discover.search.screen import Candidate, Score, Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.smooth import Table
 from psd_deflection.studies.discover.search.trials import wald_chi_square
@@ -400,6 +400,12 @@ def test_a_step_of_the_search_passes_from_the_same_limit_on(gain: float, stays: 
     search = search_of(Plant(shown, without_noise((shown[A], gain))))
     null, fit = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
     assert search.passes(null, fit, null) == stays
+
+
+def test_one_more_may_pass_by_its_chance_and_by_bic() -> None:
+    search = search_of(Plant(pictures(A), noise()), penalty=3.0)
+    for p, gain, passes in ((1e-4, 13.1, True), (1.1e-4, 13.1, False), (1e-4, 13.0, False)):
+        assert search.may_pass(Score(candidate('a', 'x'), gain, 1, p, np.zeros(1))) is passes
 
 
 @pytest.mark.parametrize(('gain', 'channel', 'stays'), [(480.0, 0, True), (320.0, 0, False), (20.0, 1, True)])

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Self, cast
@@ -97,6 +98,28 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
     result = ran(searching(plant, shown, 'abcd', message))
     assert 'a better pair: ' in ''.join(message)
     assert named(result.fit) == ['a', 'b']
+
+
+@pytest.mark.parametrize('names', [('s',), ('s', 't')])
+def test_other_shapes_are_49_over_their_whole_ranges(names: tuple[str, ...]) -> None:
+    tried: list[tuple[float, ...]] = []
+
+    class Noting(Plant):
+        def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+            first, beside = effects
+            assert beside.effect.name == 'b'
+            tried.append(tuple(first.values[n] for n in names))
+            return super().simulate(effects)
+
+    plant = Noting(pictures(A, ('a', 's'), ('a', 't'), B), noise())
+    a = active('a', x=0.1, **dict.fromkeys(names, 0.2))
+    kinds = tuple(dataclasses.replace(p, kind='shape' if p.name in names else p.kind) for p in a.effect.parameters)
+    shaped = ActiveEffect(dataclasses.replace(a.effect, parameters=kinds), a.values)
+    fit = refit(plant, [shaped, active('b', x=0.0)], iterations=0)
+    tried.clear()
+    searching(plant, plant.pictures, 'a').of_another_shape(fit)
+    inside = np.linspace(-1.0, 1.0, {1: 51, 2: 9}[len(names)])[1:-1].tolist()
+    np.testing.assert_allclose(tried[:49], list(itertools.product(inside, repeat=len(names))), atol=1e-12)
 
 
 @pytest.mark.parametrize(('late', 'again'), [(1.2, True), (0.8, False)])
