@@ -12,21 +12,25 @@ from typing import cast
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.catalogue import effect_names, make_active
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import flat_parameters
-from psd_deflection.studies.discover.applied import ringing_on, unseen
+from psd_deflection.studies.discover import recorded_rig
+from psd_deflection.studies.discover.applied import directions, ringing_on, unseen
 from psd_deflection.studies.discover.discover import discover, refitted
 from psd_deflection.studies.discover.hidden import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
-from psd_deflection.studies.discover.redundant import excess
+from psd_deflection.studies.discover.redundant import FourthReading, excess, visible
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
+from psd_deflection.studies.loads.plateaus import Plateau
+from test.studies.discover.test_formulas import make_observation
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, read
 
 ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
@@ -178,3 +182,38 @@ def test_load_time_is_unseen_in_excluded_samples() -> None:
     assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
     assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
     assert not unseen(ws, ZeroDirection(0, 0, 1e-6))
+
+
+@pytest.mark.parametrize(('began', 'ended'), [(False, False), (True, False), (False, True), (True, True)])
+def test_the_times_that_nobody_noted_are_free(began: bool, ended: bool) -> None:
+    """Beside three numbers of what hung, each in a change about its own sample."""
+    o = Observation('x', RIG, np.zeros((4000, 6)), np.zeros((4000, 3)))
+    o.loads[1000:2500] = (3.0, -4.0, 2.0)
+    ws = Workspace([o])
+    found = directions(ws, [Plateau(0, 1000, 2500, 1, began, o.loads[1000], ended)])
+    assert [d.axis for d in found[:3]] == [0, 1, 2]
+    hung = np.zeros((3, 4000, 3))
+    hung[[0, 1, 2], 1000:2500, [0, 1, 2]] = 1.0
+    assert [np.sign(d.change).tolist() for d in found[:3]] == hung.tolist()
+    wanted = [at for at, there in ((1000, began), (2500, ended)) if there]
+    assert [int(np.abs(d.change).sum(axis=1).argmax()) for d in found[3:]] == pytest.approx(wanted, abs=2)
+
+
+@pytest.mark.parametrize(('share', 'there'), [(1.1, True), (0.9, False)])
+def test_a_detector_is_acquitted_by_what_it_would_show(
+    share: float, there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If it made a fifth of what is left, it would show twice as much as the fourth reading allows."""
+    without = [name for name in effect_names() if name != 'sensor_rotation']
+    machine = RecordedRig.of([make_observation(warm=None)], RIG, without, None, lambda _: None)
+    ws = machine.compared()
+
+    def rotation(screen: Screen) -> list[Candidate]:
+        return [c for c in screen.candidates if c.effect.name == 'sensor_rotation' and c.start['psd'] == 1]
+
+    (one,) = rotation(machine.screen(ws, None))
+    least = visible(ws, machine.bank.get(one, ws))
+    reading = cast(FourthReading, SimpleNamespace(acquits=True, allowed=3.0))
+    machine = replace(machine, recorded=replace(machine.recorded, fourth=reading))
+    monkeypatch.setattr(recorded_rig, 'excess', lambda ws, residual: (2.0 * 3.0 / (0.2 * share * least), 99.0))
+    assert bool(rotation(machine.screen(ws, None))) is there
