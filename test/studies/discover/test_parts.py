@@ -158,6 +158,17 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
     assert Workspace([lost]).gap(Workspace([lost]).measured) == 0.0
 
 
+def test_pieces_of_a_recording_are_half_seconds(gappy: Workspace) -> None:
+    rng = np.random.default_rng(0)
+    a, b = (rng.standard_normal(sum(m.size for m in gappy.measured)) for _ in range(2))
+    want: list[float] = []
+    for x, y in zip(gappy.split(a), gappy.split(b), strict=True):
+        gain = 0.5 * (x**2 - y**2).sum(axis=0)
+        want += [float(gain[k : k + 125].sum()) for k in range(0, len(gain), 125)]
+    np.testing.assert_allclose(gappy.pieces(a, b), want)
+    assert len(want) == 3 + 4
+
+
 def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     """Two loads that overlap, 2 N and 5 N uncertain: noise of covariance I + A S^2 A', sizes by their priors."""
     o = make_observation()

@@ -197,6 +197,21 @@ def test_a_refit_is_least_squares_with_its_covariance() -> None:
     assert plant.simulations <= 12
 
 
+def test_a_step_that_makes_it_worse_is_damped_twenty_times_more() -> None:
+    """Of a unit in its own scale the step is 1/(1 + damping): 1e-4, 2e-3, 0.04, 0.8, 16."""
+    shown, tried = pictures(A), list[float]()
+
+    class Worse(Plant):
+        def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+            (x,) = (a.values['x'] for a in effects)
+            tried.append(x)
+            # A step of the finite difference is 5e-5.
+            return [shown[A] * (x if x < 1e-4 else -1.0)]
+
+    refit(Worse(shown, 1e-2 * shown[A]), [active('a', x=0.0)], iterations=1)
+    assert tried == pytest.approx([0.0, 5e-5, *(1e-2 / (1.0 + d) for d in (1e-4, 2e-3, 0.04, 0.8, 16.0))])
+
+
 def test_a_refit_stops_at_a_bound_and_the_rest_adapts() -> None:
     shown = pictures(A, B)
     shown['b', 'x'] += shown['a', 'x']

@@ -77,10 +77,12 @@ def test_smooth_remainder_is_function_of_its_variable() -> None:
     assert found.verdict == 'unknown_effect'
     assert 'a smooth function of along that has no name' in found.unknown[-1].signature
     assert found.remainder is not None
-    assert found.remainder.function is not None
+    function = found.remainder.function
+    assert function is not None
+    assert found.remainder.rms == pytest.approx(math.sqrt(function.before**2 - function.heldout**2))
     # It is the waves, but for what offset and slope take.
     free = np.column_stack([np.ones(30), plant.along, np.sin(9.0 * plant.along)])
-    residual = found.remainder.function.tables[0][0]
+    residual = function.tables[0][0]
     assert np.std(residual - free @ np.linalg.lstsq(free, residual, rcond=None)[0]) < NOISE
     assert 'a smooth function of along' in found.report()
 
