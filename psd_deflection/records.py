@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The records that the pipeline passes on: frozen, with shapes and units.
-
-A sample passes through them in this order: it arrives as counts in a :class:`RawChunk`. Its
-sequence number puts it into a :class:`SampleBlock`, whose average is a :class:`SpotMeans`. Each
-solver turns that into a :class:`DeflectionEstimate`, and the link model into a :class:`TipLoad`.
-Times are integer nanoseconds of ROS time; everything else SI.
-"""
+"""The records that the pipeline passes on, frozen, SI, times in integer nanoseconds: :class:`RawChunk` (counts),
+:class:`SampleBlock`, :class:`SpotMeans`, :class:`DeflectionEstimate` of each solver, :class:`TipLoad`."""
 
 from __future__ import annotations
 

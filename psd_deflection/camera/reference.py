@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From the target in each image to the tip in ``link_tip_rest``: the rest is found, and taken off turn and place alike.
-
-The rest is the mean of the first good frames: as many as ``rest.frames`` says, or, if it says 0, those that do not
-differ from the first by more than noise, at most :data:`MOST_REST`. They are answered as soon as the rest is known.
-The rest's own variance is part of every covariance.
-"""
+"""From the target in each image to the tip in ``link_tip_rest``: the rest, the mean of the first good frames
+(``rest.frames``; 0: those that do not differ by more than noise), is taken off, its variance in every covariance."""
 
 from __future__ import annotations
 

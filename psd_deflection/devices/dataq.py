@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""DATAQ DI-1110, DI-2108 and DI-4108 in CDC mode: converters with a command line, no framing.
-
-Limits compared with our own frames, which ``describe`` reports too: the device neither numbers its
-samples nor sends times. A torn scan is detected by the marker channel (``devices.protocol.dataq``)
-and counted; the loss of whole scans cannot be detected. Times are scan counts regressed on the
-host's clock.
-"""
+"""DATAQ DI-1110, DI-2108 and DI-4108 in CDC mode: no numbers, no times, no framing. A marker channel detects torn
+scans, nothing the loss of whole ones; times are scan counts regressed on the host's clock."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The declaration of a device: how it is made, simulated and recognised on a port.
-
-A device is one file with its :class:`~psd_deflection.devices.source.Source`, its simulated twin and a
-``DEVICE``, and one line in ``registry``. Everything that lists devices reads the declarations: ``source:``,
-``simulate --serve --device``, the rig that starts if no port is named, ``psd-deflection devices``.
-"""
+"""The declaration of a device, one file and a line in ``registry``: how it is made (its
+:class:`~psd_deflection.devices.source.Source`), simulated and recognised on a port."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A recording as a device, in real time: ``source: replay`` with ``port`` naming a bag, .mcap or CSV.
-
-It lets you try the node, its subscribers and a new parameter file on measured data. Samples keep their
-numbers, so a loss in the recording is a loss here. ``replay.stamps`` sets their times: ``now`` (the
-recorded intervals, from the moment of starting) or ``recorded``.
-"""
+"""A recording as a device, in real time (``source: replay``): samples keep their numbers, so a loss is a loss here;
+``replay.stamps`` sets their times, ``now`` or ``recorded``."""
 
 from __future__ import annotations
 

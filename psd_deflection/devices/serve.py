@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Serves a simulated device on pseudo-terminals or on the network, in real time.
-
-Like a USB device it sends nothing while no one has its port open. A daemon starts
-``python -m psd_deflection.devices.serve`` if no port is named: this process reads the parameters as a line of
-JSON, prints its ports, and ends when its standard input closes. Each further line is a load that holds from then on.
-"""
+"""Serves a simulated device on pseudo-terminals or on the network, in real time, as a process of its own: parameters
+come as a line of JSON, each further line is a load, and the end of its standard input ends it."""
 
 from __future__ import annotations
 

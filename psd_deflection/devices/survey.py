@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Finds which device is on which port: sends the question of every device that has a probe, and listens.
-
-Nothing is started, stopped or set: the devices answer these questions in any state. (An Arduino
-restarts anyway, because opening its port resets it.) A port that another program has open is left
-alone.
-"""
+"""Finds which device is on which port: sends the question of every device that has a probe, and listens. Nothing is
+started or set; a port that another program has open is left alone."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Devices that send one line of text per sample (``devices.protocol.text_lines``), such as an Arduino with a short
-sketch.
-
-They number their samples and send their time, so losses are detected and times are the device's own.
-Limits compared with our own frames: without the checksum a corrupted digit goes unnoticed, the device accepts
-no commands, and 115200 baud carry about 250 lines a second.
-"""
+"""Devices that send one line of text per sample, such as an Arduino: numbered and timed by the device. Without the
+checksum a corrupted digit goes unnoticed; 115200 baud carry about 250 lines a second."""
 
 from __future__ import annotations
 

@@ -1,13 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A pair of Thorlabs KPA101/TQD001 position aligners, one per PSD, each on its own port.
-
-They answer a question after about 2 ms, so 1 kHz is out of reach. The source asks both at once, in time
-slots of ``converter.sample_rate_hz``. The reachable rate is measured at the start; a higher one is rejected
-with the rate that can be reached. A slot without an answer, or for which the host was late, counts as a lost
-sample. A sample's time is half-way between question and answer, on the host's clock. The two devices are read
-within one answer time of each other, not at the same instant. A sample whose time is outside its slot is lost.
-"""
+"""A pair of Thorlabs KPA101/TQD001, one per PSD, asked at once in slots of ``converter.sample_rate_hz`` up to the rate
+that is measured at the start. A sample's time is half-way between question and answer; a slot without one is a lost
+sample."""
 
 from __future__ import annotations
 

@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``udp://HOST:PORT``: datagrams that a device sends to this machine, each with bytes of its stream.
-
-We take what comes to PORT on the address HOST of this machine. One sender at a time: the first whose bytes make
-a frame of the device's protocol. What others send is counted, and said once. A sender that was silent for
-``SILENT_S`` gives way to the next one; then the port closes, so that the new one has to introduce itself as after
-every reconnection.
-
-Datagrams may be lost, come twice, or out of order: the numbers of the samples tell.
-"""
+"""``udp://HOST:PORT``: datagrams to this machine from one sender, the first whose bytes make a frame; others are
+counted and said once. One that was silent for ``SILENT_S`` gives way, by a reconnection."""
 
 from __future__ import annotations
 

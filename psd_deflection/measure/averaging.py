@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of N by sequence number: which samples belong together, their mean and covariance.
-
-The block number is ``seq // block_size``, so a lost sample shortens one block and shifts none. A
-block is complete when its last sample, or a sample of a later block, has arrived. Lost samples are
-not filled in.
-"""
+"""Blocks of N by sequence number (``seq // block_size``: a lost sample shortens one block and shifts none), and what
+the samples of each say."""
 
 from __future__ import annotations
 

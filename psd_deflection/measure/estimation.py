@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The dots of one block -> the estimate with its covariance: by all detectors, by a subset, or by one.
-
-The primary solver solves all readings. If their check asks for it, it solves the subsets without one PSD; then the
-check excludes a PSD or none, and the estimate is made from what is left. The other solvers solve the same readings.
-The state is the last twist that was measured, for ``degraded: hold``.
-"""
+"""The dots of one block -> the estimate with its covariance: all readings, or, if their check excludes a PSD, the
+others. The state is the last twist that was measured, for ``degraded: hold``."""
 
 from __future__ import annotations
 

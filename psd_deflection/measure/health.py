@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Checks lasers and detectors from a block's samples, before the block is solved.
-
-A fault makes one detector unreliable (``faulty``). A finding is a warning that does not stop the
-estimate (``findings``). Both come from the block's own samples and the rig. One count goes on
-from block to block: for how many in a row a detector's values did not change.
-"""
+"""Checks lasers and detectors from a block's samples before it is solved: a fault makes one detector unreliable, a
+finding is a warning. One count goes on: blocks in a row in which a detector's values did not change."""
 
 from __future__ import annotations
 

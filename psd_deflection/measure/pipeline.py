@@ -1,16 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From chunks of samples to records; the live run and replay use the same class.
-
-It owns no clock, thread or I/O. Its output depends only on the rig, the samples and the order of
-calls, so ``replay`` reproduces it bit for bit. The steps are: counts -> volts -> blocks -> dots in
-metres -> correction of the effects in the rig file -> health checks -> solvers -> estimates, and
-the tip load that the link model computes from them.
-
-Its parts remember things from block to block: the noise, the motion, the twist that ``degraded: hold`` keeps, what
-effects of the link remember of past loads. Each part tells that itself (:mod:`psd_deflection.measure.state`); when a
-recording starts, it is written as a record (:meth:`Pipeline.memory`).
-"""
+"""From chunks of samples to records, by one class in the live run and in replay: no clock, thread or I/O, so the output
+is that of rig, samples and order of calls, bit for bit. Parts tell what they remember (:mod:`.state`)."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""State of the pipeline's parts from block to block, as numbers by name.
-
-A part returns what the next block depends on besides its samples (:meth:`Part.state_dict`, which changes nothing), and
-goes on from another one's (:meth:`Part.load_state_dict`). The values are recorded; from there a replay gives the same
-bits.
-"""
+"""State of the pipeline's parts from block to block, as numbers by name: recorded, so that a replay goes on with the
+same bits."""
 
 from __future__ import annotations
 

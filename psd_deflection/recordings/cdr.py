@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Converts message field dicts to CDR bytes and back.
-
-The node publishes and the recorder writes the same bytes (XCDR1, little-endian, header
-``00 01 00 00``), so a message is encoded once. The encoders are made from the message definitions.
-Seven of a block's eight messages consist of a header and numbers: they are packed in one step, and
-:func:`numbers` reads them in one step. The decoders of all others are made from the definitions too;
-``clouds`` reads the samples.
-"""
+"""Message field dicts to CDR (XCDR1, little-endian) and back, by coders made from the message definitions; headers and
+numbers in one step."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a recording that ends in a crash: index and summary for each file, ``metadata.yaml`` for the bag.
-
-Every intact message of a file is copied into a new file beside it, its bytes unchanged; chunks and indexes are made
-anew. Only then is the old file renamed to ``NAME.mcap.cut`` and the new one takes its name, so a failed repair loses
-nothing. Complete files are not touched.
-"""
+"""Repairs a recording that ends in a crash: every intact message is copied into a new file with index and summary, and
+only then the old one is renamed to ``NAME.mcap.cut``. A failed repair loses nothing."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every parameter of a rig, declared once.
-
-Each field of a section declares one parameter: its type, default, unit, bounds and a sentence. The
-sections of how the node runs on one machine are in :mod:`psd_deflection.rig.running`. Everything
-else is derived from these: :data:`PARAMETERS`, the checks, ``psd-deflection params``,
-the node's descriptors and the documentation. A new parameter is one more field.
-"""
+"""Every parameter of a rig, declared once: type, default, unit, bounds and a sentence. Checks, ``psd-deflection
+params``, the node's descriptors and the documentation are derived; how the node runs is in
+:mod:`psd_deflection.rig.running`."""
 
 from __future__ import annotations
 

@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``camera``: images in, ``/reference/deflection`` out, with its covariance and the reasons of rejected
-frames.
-
-It subscribes to ``image`` (sensor_msgs/Image) and ``image/compressed``
-(sensor_msgs/CompressedImage), and takes the lens from ``camera_info`` beside the image if no
-parameter ``camera.matrix`` says it. A parameter that is set takes effect with the next frame. The
-executor runs in the main thread; of the frames that come while one is measured, all but the last
-are dropped.
-"""
+"""The node ``camera``: images (raw or compressed) in, ``/reference/deflection`` with covariance out, and why frames are
+rejected. Of the frames that come while one is measured, all but the last are dropped."""
 
 from __future__ import annotations
 

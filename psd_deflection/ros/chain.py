@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``chain``: several rigs in one process, and the end effector composed of them.
-
-It publishes ``end_effector/deflection`` in the frame ``end_effector_rest``, each link's topics
-below the link's name, and all frames from the base to the end effector on ``/tf``. ``joint_states``
-turns the joints that the chain file names. ``~/zero`` and ``~/record`` act on every link. The
-executor runs in the main thread; estimates are published by the pipeline threads.
-"""
+"""The node ``chain``: several rigs in one process, their topics below each link's name, and the end effector composed
+of them, with all frames on ``/tf``. ``~/zero`` and ``~/record`` act on every link."""
 
 from __future__ import annotations
 

@@ -1,15 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``estimator``: publishes the pipeline's records, from the pipeline's own thread.
-
-A message is encoded once; the same bytes are published and recorded. The executor in the main
-thread serves parameters, services, inputs and the 1 Hz diagnostics, nothing faster.
-
-It is a lifecycle node (REP-2002 states). *Configured*, it has the port, reads, estimates and
-records; *active*, it publishes as well. Deactivation stops publishing and nothing else, cleanup
-frees the port. With ``autostart`` (the default) it does both steps itself and behaves like an
-ordinary node.
-"""
+"""The node ``estimator``, a lifecycle node (REP-2002): *configured* it reads, estimates and records; *active* it
+publishes too, from the pipeline's own thread. The executor serves parameters, services, inputs and the 1 Hz
+diagnostics."""
 
 from __future__ import annotations
 

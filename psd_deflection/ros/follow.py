@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Goals of FollowJointTrajectory, passed on to the controller's action with their trajectories shaped.
-
-What the controller says of a goal is what its sender hears: feedback, result, that it is cancelled
-or that a new goal takes its place. One goal after the other is sent, each when the controller has
-answered the one before it. Everything is done in the executor's thread, and nothing waits: a
-controller that does not answer ends a goal after a bounded time, with the reason.
-"""
+"""Goals of FollowJointTrajectory, passed on with shaped trajectories, one after the other; what the controller says is
+what the sender hears. Nothing waits: no answer ends a goal after a bounded time, with the reason."""
 
 from __future__ import annotations
 

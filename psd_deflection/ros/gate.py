@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What other nodes send comes in through one gate: what cannot be used is rejected, counted, and said once.
-
-A message is bounded in size before it is unpacked, and a topic in messages a second. A check gives the reason why a
-message is rejected, or ''. A message that makes a node's own code fail is rejected, too: no message ends a node.
-
-Goals of an action come through it, too. rclpy shows a goal only unpacked: one that is too large is rejected before
-anything is done with it, but it was in memory.
-"""
+"""What other nodes send, messages and goals, comes in through one gate: bounded in size and rate, checked, and what
+cannot be used is rejected, counted and said once. No message ends a node."""
 
 from __future__ import annotations
 

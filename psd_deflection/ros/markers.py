@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Markers for RViz: link, plate, detectors, beams and dots.
-
-They are published if the parameter ``markers`` is on. Static parts (beams, lasers, link at rest)
-are latched, so that an RViz started later shows them. Moving parts are removed if there is no
-estimate, and expire if messages stop, so that only measured poses are shown. Micrometres are
-invisible beside half a metre, so displacements are drawn ``markers_magnify`` times as large; the
-transforms are true to scale.
-"""
+"""Markers for RViz: link, plate, detectors, beams and dots, displacements magnified. Static parts are latched; moving
+ones go when there is no estimate."""
 
 from __future__ import annotations
 

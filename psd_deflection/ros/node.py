@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What every node of this package is, before it does anything of its own.
-
-A lifecycle node (REP-2002) with declared parameters, a log on ``/rosout``, a gate for what other nodes send, and
-diagnostics once a second named ``NODE: PART``. It says so when another node publishes what it publishes. With
-``autostart`` (the default) it configures and activates itself and behaves like an ordinary node.
-"""
+"""What every node of this package is: a lifecycle node (REP-2002) with declared parameters, a log on ``/rosout``, a
+gate for what other nodes send, and diagnostics once a second. With ``autostart`` it activates itself."""
 
 from __future__ import annotations
 

@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``shaper``: joint trajectories in, the same out, shaped so that they do not ring the link.
-
-It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. With the parameter
-``action`` it does the same for goals of FollowJointTrajectory. What cannot be followed is rejected,
-with the reason in the log and in ``/diagnostics``. ``joint_states`` tells where the
-joints are; the parameter ``urdf`` says where their limits are: in a file, or on
-``robot_description``. Everything is done in the main thread.
-"""
+"""The node ``shaper``: joint trajectories (``~/trajectory``, or goals of ``action``) in, the same shaped out, so that
+they do not ring the link. What cannot be followed is rejected with the reason."""
 
 from __future__ import annotations
 

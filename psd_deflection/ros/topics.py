@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic of the nodes: :data:`PUBLISHED` and :data:`HEARD` have a row for each, and
-:data:`SERVED` one for each action. It needs no rclpy.
-
-Publishers, subscriptions and actions are made from a row alone (``endpoints.publisher_of``,
-``InputGate.listen``, ``InputGate.serve``): name, type and QoS stand nowhere else, and a topic without
-a row can be neither published nor heard. ``python -m tools.pages`` writes the table of ``docs/topics.md`` from
-these rows.
-"""
+"""Every topic of the nodes, a row each (:data:`PUBLISHED`, :data:`HEARD`, :data:`SERVED`), from which publishers,
+subscriptions, actions and ``docs/topics.md`` are made; names of frames and services. It needs no rclpy."""
 
 from __future__ import annotations
 

@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The reader thread turns a source's samples into chunks with host times and puts them in a bounded queue.
-
-The reader owns the source, the sequence numbers and the clock. It hands over a chunk as soon as the
-last sample of a block has come, so that the estimate is not delayed. If the consumer is too slow,
-the newest chunk is dropped and counted; the reader never waits.
-
-Every missing sample is counted once, under its cause (``lost_by``) if that is known: the device
-reported the loss, frames around it were damaged, the port was away, or none of these.
-"""
+"""The reader thread owns source, sequence numbers and clock, and puts chunks with host times on a bounded queue, each
+as soon as its block is complete. It never waits; every missing sample is counted once, under its cause."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Hands each alarm of the watch on: to a command of the user's, and to a web address (webhook).
-
-Both get the same JSON object. A thread of its own does it, so that neither a command that hangs nor a network
-that is down holds up a sample. Each has bounded time, and a bounded number of alarms may wait. What fails is said
-once, until it works again, and counted.
-"""
+"""Hands each alarm of the watch to a command and to a web address, as one JSON object: in a thread of its own, bounded
+in time and number. What fails is said once and counted."""
 
 from __future__ import annotations
 

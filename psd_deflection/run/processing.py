@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The pipeline thread: takes chunks off the queue, runs the pipeline, gives its records to the sinks.
-
-It is the only thread that touches the pipeline. Requests from other threads (take the zero, attach
-or detach a recording) run between two blocks, never within one. A request must not wait for
-anything, because the estimates wait for the request.
-"""
+"""The pipeline thread: takes chunks off the queue and gives records to the sinks. Requests of other threads run between
+two blocks and must not wait for anything."""
 
 from __future__ import annotations
 

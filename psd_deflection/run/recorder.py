@@ -1,17 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder thread writes the published messages to a bag without delaying the pipeline.
-
-Each recording has its own thread, the only one that touches the disk. It opens the bag, asks the
-pipeline thread to attach the recording between two blocks, writes the messages, and closes the bag
-once the recording is detached. Attaching and detaching swap one reference. A caller that starts or
-ends a recording gets a future, which is resolved when the disk has answered.
-
-Encoded messages come through a bounded queue. A message that does not fit is dropped and counted. A
-disk error, or a disk with less room than the reserve, ends the recording with a message;
-acquisition and publishing continue. A chunk that is on the disk survives a crash. A chunk ends
-after half a second of log time, or after half a second without messages.
-"""
+"""The recorder thread writes the published messages to a bag without delaying the pipeline: a bounded queue, whose
+overflow is counted; a disk error or too little room ends the recording, never the run. It attaches between two
+blocks."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One run of the daemon: device, reader, pipeline, sinks and recorder.
-
-The ROS node and the command line both use it; neither is needed. Threads: ``reader`` (acquisition),
-``pipeline`` (processing), ``recorder`` while recording; the caller's own thread opens, sends requests and
-closes. Only the threads ``recorder`` and ``zero`` wait for the disk. ``zero`` saves a zero and then ends.
-"""
+"""One run of the daemon, for node and command line: device, ``reader``, ``pipeline``, sinks, ``recorder`` (threads).
+Only ``recorder`` and ``zero`` wait for the disk."""
 
 from __future__ import annotations
 

@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The watch in a run: feeds it, says what it sees, and keeps the minutes around it as a recording.
-
-The samples and inputs of the last minutes are kept in memory as they were encoded, in segments; each begins with the
-rig and the pipeline's memory, so that a replay of what is kept computes what the run did. Nothing is kept unless
-``watch_dir`` names a folder, and nothing is written unless there is an alarm. A thread of its own writes.
-
-Memory is bounded in bytes (``watch_memory``) and in time, whether blocks come or not; the folder in bytes and in
-number (``watch_dir_max_bytes``, ``watch_dir_max_recordings``). The oldest goes first.
-"""
+"""The watch in a run: the last minutes are kept encoded in memory, bounded in bytes and time, each segment with the rig
+and the pipeline's memory; an alarm writes them below ``watch_dir``, in a thread of its own."""
 
 from __future__ import annotations
 

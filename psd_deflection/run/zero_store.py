@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps the unloaded dots of the last ``~/zero`` from run to run: one small file per device.
-
-The file is below ``$XDG_STATE_HOME/psd_deflection``, named by the device's serial number, or is the file
-that ``zero_file`` names. The rig file has priority: the kept file also holds the zero that the rig file had
-at the time, and once the rig file changes its zero the kept one is ignored. The values are checked like any
-parameter. A bad file is ignored with a line in the log; it never stops a run. A thread writes the file, so
-that taking a zero does not wait for the disk.
-"""
+"""Keeps the unloaded dots of the last ``~/zero``, a small file per device (or ``zero_file``), with the rig file's zero
+of that time: once that changes, the kept one is ignored. A bad file is ignored with a line in the log."""
 
 from __future__ import annotations
 

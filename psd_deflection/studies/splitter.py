@@ -1,20 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Two lasers over one beam splitter (thesis 5.4): its three rules for a rig, and what a failure does, simulated.
-
-Both lasers are made one beam, which a splitter halves, one half for each PSD. The rules:
-
-1. The lasers' powers together are at most twice what one PSD is allowed to get.
-2. If one laser fails, half of the other's power is enough for both PSDs.
-3. They need not run together: the second one may be a cold spare, which is switched on when the first one fails.
-
-Two lenses (Fig. 5.11) do not make two parallel beams one: they leave the second lens side by side, so the dots of the
-two lasers lie apart on each PSD (:func:`dots_apart`). Beside the zero that was taken before, a change of the light is
-then a displacement of the tip that it has not made.
-
-The gain of the amplifier is the one that makes the light of every day ``sum_nominal``: of both lasers, or of the first
-one if the second is a spare. What an amplifier puts on a reading goes with one over the sum signal.
-"""
+"""Two lasers over one beam splitter (thesis 5.4), one half of their beam for each PSD: together at most twice the power
+of one PSD; half of one is enough for both; the second may be a cold spare. What a failure does is simulated."""
 
 from __future__ import annotations
 

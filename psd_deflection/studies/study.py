@@ -1,11 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The shape of every study: recordings give a problem, steps solve it, the result says, shows and writes itself.
-
-A study is a folder. ``from_recordings.py`` reads the problem, which is frozen and has arrays alone. A function of
-the study's name takes it and gives a :class:`StudyResult`. So the command and Python write the same files, and every
-page has the same form: the answer first, then sections, then what it was made from.
-"""
+"""The shape of every study: recordings give a frozen problem of arrays (``from_recordings.py``), a function of the
+study's name takes it and gives a :class:`StudyResult`, which says, shows and writes itself: answer, sections, what it
+is of."""
 
 from __future__ import annotations
 

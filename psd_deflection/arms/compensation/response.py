@@ -1,15 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measures by how much joints move with their offsets: what a controller reports of itself is no measurement.
-
-On an arm at rest the measured positions q of a joint are a + s f(o): f is the offset o behind a lag of first order. A
-least squares fit gives the slope s, which is 1 if the controller adds the offsets. Its half-width is what could be
-wrong with it at worst: all that the fit leaves of q has the shape of f, the encoder is a step off, or another lag fits
-as well. It shrinks as the offsets move further, so a small offset or a coarse encoder leaves the slope unknown.
-A fit begins and ends with an arm at rest: the inertia of an arm that starts to move bends the link, and moves the
-offsets with it. A slope that was right is wrong only if two motions in a row say so: the first may be one that the arm
-was commanded to while its load changed.
-"""
+"""Measures by how much joints move with their offsets o: on an arm at rest, q = a + s f(o), f a lag of first order; s
+is 1 if the controller adds them. Its half-width is what could be wrong at worst. Two motions in a row must say that s
+is wrong: the load may have changed in one."""
 
 from __future__ import annotations
 

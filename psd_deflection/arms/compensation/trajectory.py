@@ -1,16 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes a joint trajectory, so that the motion does not ring the link.
-
-Between its points a trajectory is what ros2_control's joint_trajectory_controller makes of it: a line if it has
-positions alone, a cubic with velocities, a quintic with accelerations. The shaped one is a weighted sum of the same
-motion, begun at the shaper's times. It has a point wherever one of them has one, so the controller follows it
-exactly. All weights are positive with the sum 1: positions, velocities and accelerations stay within the bounds of
-what was given.
-
-A trajectory that replaces one under way goes on from it: what is shaped is the whole history of the command. So that
-it makes no step, whoever follows it must begin when we did: :func:`start_of`.
-"""
+"""Shapes a joint trajectory as ros2_control interpolates it (line, cubic, quintic): a weighted sum, weights positive
+with sum 1, of the same motion begun at the shaper's times, so all bounds hold. What is shaped is the whole history."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where the PSDs, the beams and the link are; an unsolvable layout is rejected with the reason.
-
-Theory of operation. A dot reading m_i is where laser i falls on PSD i, from the PSD's centre c_i,
-in plate axes. Before load it was m_i0, so the beam is at l_i = c_i + m_i0, fixed to the base. The
-plate point under it is now q_i = c_i + m_i.
-"""
+"""Where the PSDs, the beams and the link are, as every solver takes them; an unsolvable layout is rejected with the
+reason."""
 
 from __future__ import annotations
 

@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The forward model: from loads to converter counts, all at once or in steps of any size.
-
-Theory of operation. A :class:`SimulatedSamples` holds consecutive samples, one row per quantity, and passes
-the stages in order. The simulator keeps the state between steps (modes, hysteresis, delays), so a
-history cut anywhere gives the same samples bit for bit. For this reason every operation is
-elementwise or a recursive filter, and the noise is drawn sample by sample. Effects act at named
-points (:data:`~psd_deflection.model.simulation.declaration.Point`).
-"""
+"""The forward model: from loads to converter counts, all at once or in steps of any size with the same bits: states are
+kept, every operation is elementwise or a recursive filter, noise is drawn sample by sample."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""From the tip's pose to the load that causes it, through the effects that the rig file lists; knows no effect by name.
-
-The inverse of the forward model at rest. Its order is: loads, effects on them, static pose (by the constants, as the
-effects changed them), effects on it, the link's modes, effects on its pose. So the pose's effects are traced back, the
-last one first; then the constants give the load, and its effects are traced back.
-"""
+"""From the tip's pose to the load that causes it, at rest, through the effects that the rig file lists, the last one
+first; it knows no effect by name."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The solver names that ``solver:`` and ``solvers:`` of a rig file may contain.
-
-To add a method, write a class (see :class:`~psd_deflection.model.solvers.interface.Solver`) and add a line here. The
-class declares which parameters are its options and how its errors are budgeted. The module is imported only when
-the method is used.
-"""
+"""The solver names of ``solver:`` and ``solvers:``. To add a method, write a
+:class:`~psd_deflection.model.solvers.interface.Solver` and add a line here; it is imported when it is used."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Reads one MCAP file from front to back, even if it is cut or damaged.
-
-If a file lost its end, or a chunk is damaged, everything else is read, with a warning. Every size that a file
-declares is compared with the file's own size or with the :mod:`~psd_deflection.recordings.mcap_format` before
-it is used.
-The format: https://mcap.dev/spec.
-"""
+"""Reads one MCAP file (https://mcap.dev/spec) from front to back, even cut or damaged, with a warning. Every size that
+it declares is compared with the file's own or with the allowance before it is used."""
 
 from __future__ import annotations
 

@@ -1,15 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Compares the messages of a replay with the recorded ones, byte by byte.
-
-Messages are matched by topic and stamp. A recording may be partial: topics that it does not have, and the time
-before the first and after the last message of a topic, are not compared. A recorder other than ours may also miss
-messages in between. Both sides are read as streams, so that recordings of any length are compared in little memory.
-
-Messages whose numbers agree to far more digits than a measurement has differ by rounding: another version or library
-added up in another order. They are counted apart. Such a difference is a defect only if nothing that computes has
-changed since the recording was made (:mod:`psd_deflection.recordings.provenance`).
-"""
+"""Compares the messages of a replay with the recorded ones, byte by byte, in streams, by topic and stamp; a recording
+may be partial. Rounding is counted apart: a defect only if nothing that computes has changed (provenance)."""
 
 from __future__ import annotations
 

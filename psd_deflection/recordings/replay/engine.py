@@ -1,10 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Replay: a recording through the same pipeline as in the live node, block by block.
-
-Commands, the monitor and the benchmarks use it. ``source: replay`` is different: it is a device
-(:mod:`psd_deflection.devices.replay`) that plays only the samples, in real time.
-"""
+"""Replay: a recording through the same pipeline as in the live node, block by block, for commands, monitor and
+benchmarks."""
 
 from __future__ import annotations
 

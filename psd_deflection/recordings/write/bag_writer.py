@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and single MCAP files.
-
-A crash must cost at most a second. So chunks span less than half a second of log time and are
-handed to the operating system when they end (``durable``: written to the disk). The rig is the first
-message of every file. After a crash,
-:mod:`psd_deflection.recordings.read.bag_reader` reads the file up to the cut, and
-:mod:`psd_deflection.recordings.repair` repairs it.
-"""
+"""Writes rosbag2 bags and single MCAP files. A crash costs at most a second: chunks span less than half a second, and
+the rig is the first message of every file."""
 
 from __future__ import annotations
 

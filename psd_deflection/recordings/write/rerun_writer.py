@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a Rerun recording that includes its layout (blueprint), so that the viewer shows it at once.
-
-Rerun can open our MCAP but shows no view of it. The units are those of ``plot``: µm, mdeg and mm. A block
-without an estimate is a row without values, which breaks the line and removes the dot. A block that is
-completely lost appears only in the count of lost samples.
-"""
+"""Writes a Rerun recording with its layout, in µm, mdeg and mm. A block without an estimate breaks the line; a lost one
+appears only in the count of lost samples."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Serves what is measured to Foxglove, without ROS: the messages of the graph, over Foxglove's WebSocket protocol.
-
-The protocol is ``foxglove.websocket.v1`` (https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md), as far as
-a viewer needs it. Messages are the ones that ROS and the recording get: the same topics, types (``ros2msg``) and
-bytes (CDR). A slow viewer loses its oldest messages, and one that does not read is dropped; we wait for none.
-Viewers can only look: the server offers neither publishing nor services nor parameters.
-"""
+"""Serves the messages of the graph to Foxglove, without ROS (``foxglove.websocket.v1``): the same topics, types and
+bytes. A slow viewer loses its oldest messages; viewers can only look."""
 
 from __future__ import annotations
 

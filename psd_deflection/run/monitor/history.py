@@ -1,17 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The last days in cells of a second, ten seconds and a minute, for the page's windows of hours.
-
-A cell has the least, the greatest and the mean of each quantity over the blocks that came in its time, the samples
-that were lost and how many blocks had an estimate. A time without blocks has no cell, and nothing is filled in.
-Each level is a ring of cells whose memory is taken at the start, so that it never grows. What is asked for is merged
-to cells as wide as needed; the merge of cells is exact.
-
-The cells of ten seconds, and the marks, are what :mod:`.kept_history` keeps from run to run.
-
-Time that goes back (a clock that is set, a recording that is sought or begins again) leaves what lies before it, and
-forgets what lies after it.
-"""
+"""The last days in cells of a second, ten seconds and a minute: least, greatest and mean of each quantity, lost
+samples, estimates. Rings of fixed memory, merged exactly to what is asked; a time without blocks has no cell, and time
+that goes back forgets what lies after it."""
 
 from __future__ import annotations
 

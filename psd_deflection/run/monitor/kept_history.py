@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps the page's history from run to run: an SQLite file per device, written by a thread of its own.
-
-The file has the cells of ten seconds of the last week and the marks, some megabytes at most. It is written once a
-minute: what a killed daemon loses is less than that. A file that is damaged is put aside and begun anew. Nothing that
-the disk does, hanging included, reaches the page or the run.
-"""
+"""Keeps the page's history of a week in an SQLite file per device, written once a minute by a thread of its own. A
+damaged file is put aside; nothing that the disk does reaches the page or the run."""
 
 from __future__ import annotations
 

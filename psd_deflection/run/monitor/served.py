@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The pages that this user's daemons serve now, so that commands find them without an address.
-
-Each page has a small file below ``$XDG_STATE_HOME/psd_deflection`` while it is served. Only the user can
-read it: it holds the token, if there is one. A file that a killed daemon left behind is removed by the
-next look.
-"""
+"""The pages that this user's daemons serve now, a small file each below ``$XDG_STATE_HOME/psd_deflection`` that only
+the user can read (it holds the token), so that commands find them without an address."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The page's own thread: an aiohttp server with the page, a websocket and two buttons.
-
-All its buffers have a fixed size: the rows of the last minute, the cells of the last days (:mod:`.history`), the last
-messages, one cursor per browser. A browser gets new rows once its last message has been sent. If it is too slow it
-misses rows (its traces have gaps), and nothing waits for it. A bad request gets an error response, never a traceback
-in the log. Idle connections are closed before they use up the daemon's file descriptors.
-"""
+"""The page's own thread: an aiohttp server with the page, a websocket and its buttons; buffers of fixed size. A browser
+that is too slow misses rows, and nothing waits for it."""
 
 from __future__ import annotations
 

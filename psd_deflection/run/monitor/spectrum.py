@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Amplitude spectral density of the dots from the last seconds of raw samples.
-
-Welch's method (P. D. Welch, IEEE Trans. Audio Electroacoust. 15, 1967): Hann windows, half
-overlapping; the mean is removed, a linear trend is not. A segment holds only consecutive samples: a lost
-sample ends it, and nothing is filled in. A sample without light ends it too, because its position, 0 mm,
-is not that of a dot.
-"""
+"""Amplitude spectral density of the dots from the last seconds of raw samples (Welch, IEEE Trans. Audio Electroacoust.
+15, 1967: Hann windows, half overlapping). A lost sample, or one without light, ends a segment."""
 
 from __future__ import annotations
 

@@ -1,11 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of the budget besides the rig file, each with default, unit, bounds and source.
-
-A tolerance is the half-width of a uniform distribution (its standard deviation is the half-width
-over sqrt 3). A "typical" value is a standard deviation. The source of a guess begins with
-"assumption": replace these first by values of the real rig.
-"""
+"""The inputs of the budget besides the rig file, each with default, unit, bounds and source: a tolerance is the
+half-width of a uniform distribution, a "typical" value a standard deviation, an "assumption" a guess to replace
+first."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What recordings say of a rig: the fit, what it cannot determine, whether unseen motion agrees.
-
-A parameter is undetermined if its standard deviation stays above ``OPEN`` of its tolerance. It keeps the file's
-value and tolerance, and the rest is fitted again with it held there; its tolerance enters the covariance of the rest.
-Of what is left, a direction (a combination, each parameter in units of its tolerance) is undetermined by the same
-measure. A prior that the recordings contradict is widened: a tolerance is a guess.
-"""
+"""What recordings say of a rig. A parameter or direction whose standard deviation stays above ``OPEN`` of its tolerance
+is undetermined: it keeps the file's value and tolerance. A prior that the recordings contradict is widened."""
 
 from __future__ import annotations
 

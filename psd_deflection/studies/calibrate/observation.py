@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One recording as arrays, and the rows that a calibration fits: the dots at the times of the reference.
-
-A polynomial of degree 6 through 21 samples gives the dots at a time, their speed and their noise. It follows the
-link's modes to 1e-5 of their amplitude, which a mean of 20 samples does not. A reference that comes in almost
-every sample is averaged over a block together with the dots.
-"""
+"""One recording as arrays, and the rows that are fitted: the dots at the times of the reference, by polynomials of
+degree 6 through 21 samples, which follow the modes to 1e-5, or means beside a reference in almost every sample."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Leads a person through three pushes, and takes each when it is held: nobody needs a free hand for a key.
-
-Fed with the device's volts chunk by chunk, it says what to do next and sees for itself when the link rests, is pushed
-and is let go. It ends with the pushes as :class:`~psd_deflection.studies.check.wirings.PushResponse`.
-"""
+"""Leads a person through three pushes: says what to do next, and sees when the link rests, is pushed and is let go."""
 
 from __future__ import annotations
 

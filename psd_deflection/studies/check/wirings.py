@@ -1,15 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which of all wirings of a two-PSD rig explain how the dots answered to pushes.
-
-A push along +X moves both dots along -x, one along +Y both along -y, and a turn about +Z moves dot i by θ times
-(l_iy, -l_ix): the columns of :func:`psd_deflection.model.plate.linear.design_matrix`. The size is left open, because
-nobody knows the stiffness of a new rig: only direction and proportion count. Four signs, two orders of the axes of each
-PSD and the exchange of the PSDs are 128 wirings. Each is held against each push.
-
-The misfit of a wiring to a push is the share of the squared movement that the expected pattern leaves over when its
-size is fitted, 0 to 1. One wrong sign leaves half of a push or more. A push that is 25 degrees off leaves a fifth.
-"""
+"""Which of the 128 wirings of two PSDs explain how the dots answered to pushes, of free size: the misfit is the
+share of the squared movement that the expected pattern leaves, 0 to 1. A wrong sign leaves half or more, 25 degrees
+a fifth."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Free loads of a search: what hung where another load was noted, and weights that sway.
-
-A movement of the plate that swings is a weight that sways. A few wrong notes stand out (:mod:`.loads.plateaus`) and are
-free before any search. If all notes are wrong (rounded), they are free only if the search has failed, and if free loads
-then leave next to nothing.
-"""
+"""Free loads of a search: what hung where another load was noted, and weights that sway. If all notes are wrong, loads
+are free only if the search has failed and free loads then leave next to nothing."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a rig can be asked to do, and how well it would tell two explanations apart.
-
-Criterion (T-optimality, Atkinson and Fedorov, Biometrika 62 (1975) 57): the chi-square that remains between what one
-model predicts and what the other can be fitted to, the other's parameters adapted to the old data and the new together.
-Information adds up over the pieces of a recording, so each piece is simulated once and recordings are put together in
-sums.
-"""
+"""What a rig can be asked to do, and how well it would tell two explanations apart: the chi-square that remains when
+one is fitted to what the other predicts (T-optimality, Atkinson and Fedorov, Biometrika 62 (1975) 57)."""
 
 from __future__ import annotations
 

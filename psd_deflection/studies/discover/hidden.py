@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the search adjusts besides the catalogue's effects: mistakes of the set-up, and how a recording began.
-
-Each is declared as an effect is, so that one search weighs all of them against each other; none is in the catalogue or
-goes into a rig file's ``effects:``. The mistakes become lines for the rig file (:mod:`.setup`). How the link moved
-before the first sample is nobody's mistake: it is adjusted and not told.
-"""
+"""What the search adjusts besides the catalogue's effects, each declared as one: mistakes of the set-up, which become
+lines for the rig file, free loads, and how the link moved before the first sample."""
 
 from __future__ import annotations
 

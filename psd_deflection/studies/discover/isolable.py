@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which effects of the catalogue could be distinguished, from the rig alone, before anything is recorded.
-
-The signature of each effect is simulated under loads that are planned, beside the noise of the rig. The chi-square of
-a signature grows with the square of the effect's size. An effect is seen from the size at which a search would accept
-it. It is named from the size at which the part that no other single effect can imitate reaches ``SEPARATES``; that
-part is sin² of the angle between the two signatures. As in a search, an effect with more free parameters is no
-alternative of one that does with fewer. All of it is to first order.
-"""
+"""Which effects could be told apart, from the rig and planned loads alone: seen from the size at which a search accepts
+it, named from the size at which the part that no other effect imitates reaches ``SEPARATES``; to first order."""
 
 from __future__ import annotations
 

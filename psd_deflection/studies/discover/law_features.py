@@ -1,11 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a law may be made of: terms, and how much of a residual each explains to first order.
-
-A law adds to one quantity of the chain. To first order the readings answer linearly: what is added to a pose moves the
-dots by the Jacobian of the optics, what is added to a static pose passes the link's modes first, and what is added to a
-dot shows in one channel. So thousands of terms are scored without a simulation.
-"""
+"""What a law may be made of: terms, and how much of a residual each explains to first order, without a simulation."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A law for what no effect of the catalogue explains: where it acts, on what it depends, and how.
-
-Terms are scored on the residual to first order, the best are refitted as effects in the simulation together with the
-effects found so far, and further terms are added and dropped by BIC (sparse regression in the loop). A law is reported
-only if it passes the rule for an effect and explains most of what is left; laws that the recording cannot tell from it
-are listed beside it.
-"""
+"""A law for what no effect explains: terms scored to first order, the best refitted in the simulation and chosen by
+BIC. It is reported if it passes the rule for an effect and explains most of what is left."""
 
 from __future__ import annotations
 

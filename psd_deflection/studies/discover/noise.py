@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates the noise from rest and from frequencies without effects, not from the discrepancy itself.
-
-The level comes from the upper half of the residual's spectrum (no link motion there), using the
-lower nine tenths of the frequencies, so that lines of mains and modes do not affect it. The colour
-comes from rest: before the first load, and long after the last change. An autoregressive model is
-fitted only if the rest is clearly correlated; otherwise the noise is taken as white, which makes the
-tests more sensitive.
-"""
+"""Estimates the noise, not from the discrepancy itself: its level from the upper half of the residual's spectrum,
+without lines; its colour from rest, autoregressive only if clearly correlated; 1/f from the light of each PSD."""
 
 from __future__ import annotations
 

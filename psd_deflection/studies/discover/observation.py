@@ -1,10 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The input of discover: one recording as arrays on a complete sample grid, with its own rig.
-
-The rest of the package does not read files: a reader fills an :class:`Observation`. Lost samples
-are NaN, so the simulation runs on the true time axis and no sample is made up.
-"""
+"""The input of discover: one recording as arrays on a complete sample grid, lost samples NaN, with its own rig."""
 
 from __future__ import annotations
 

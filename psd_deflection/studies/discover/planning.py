@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The next recording: the one that best tells apart the explanations that the recordings so far leave.
-
-``named`` is the model of the answer, ``rivals`` are those that the data does not exclude. The value of a recording is
-the mean over all pairs of them, and over which of the two is true, of the chi-square by which the wrong one would lose,
-counted up to ``SURE``. Of recordings with the same value the one with less effort is taken.
-"""
+"""The next recording: of those that the limits allow, the one whose chi-square best tells the named model from its
+rivals, averaged over all pairs and counted up to ``SURE``; with less effort at the same value."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The same search on any machine that can simulate itself: :func:`discover_in`.
-
-A real machine differs from its model by far more than sensor noise, and nobody knows by how much. So the level of what
-remains is a parameter of the likelihood here (for each channel N log RSS, not below the noise if that is known), and N
-counts correlation times. Everything else is the search of :mod:`.search` and the verdict of :mod:`.weighing`.
-"""
+"""The same search on any machine that can simulate itself, :func:`discover_in`: the level of what remains is a
+parameter of its likelihood (N log RSS for each channel), and N counts correlation times."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the steps of discover know of a machine and of what its simulation lacks.
-
-A :class:`Problem` is frozen; each step takes one and gives the next. The rig with its recordings and a plant that
-simulates itself are both a :class:`Machine`, so the steps are the same for both.
-"""
+"""What the steps of discover know of a :class:`Machine` (the rig with recordings, or a plant) and of what its
+simulation lacks. A :class:`Problem` is frozen; each step gives the next."""
 
 from __future__ import annotations
 

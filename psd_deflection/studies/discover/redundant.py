@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Two PSDs give four readings, a plate has three ways to move: the fourth reading, asked before any model of the link.
-
-P PSDs have 2P - 3 such numbers. They are taken in units of the noise and made orthonormal there, so that each is noise
-of unit variance, and none follows another, if nothing is wrong.
-
-What the readings lack to the simulation is taken apart: a movement of the plate, and what no movement of a plate makes.
-If the latter is noise, no detector, beam or amplifier is at fault, as far as its fault would show there; if it is more,
-one of them is, and the link may be as well.
-"""
+"""Of 2P readings of P PSDs a plate moves three; the other 2P - 3, orthonormal in units of noise, ask before any model
+of the link whether a detector, beam or amplifier is at fault."""
 
 from __future__ import annotations
 

@@ -1,16 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The recording is checked before the physics: wiring, signs and units of the loads, and what the search found besides.
-
-Signs, exchanged axes and exchanged PSDs make 128 wirings of two PSDs. Each is held against the whole recording: the
-movement that each load alone would cause is simulated, and every wiring's readings are fitted by these movements with
-free sizes. The sizes tell the sign and the unit of each load. A wiring that is not the rig file's must leave ten times
-less.
-
-More PSDs have too many wirings for that. Of these any two PSDs may be wired otherwise than the rig file says, or all of
-them in one way, each with any two PSDs exchanged and with none: some 700 wirings of three PSDs, 12 560 of six. No
-parameter of the rig file says that others than PSD 1 and 2 are exchanged, so that has no line.
-"""
+"""The recording is checked before the physics: each of 128 wirings of two PSDs (of more: two wired otherwise, or all)
+is held against the whole recording, with free sizes of the loads that tell their signs and units; another than the rig
+file's must leave ten times less."""
 
 from __future__ import annotations
 

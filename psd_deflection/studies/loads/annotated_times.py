@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""When annotated loads began to act, by the motion of the dots: a person notes a weight some seconds after it was hung.
-
-Steps of the dots (:mod:`.steps`) and notes are matched in their order. If they agree, or all notes are late alike,
-nothing is changed. Else each load gets the time of its step. Only the link's natural frequencies are taken from the rig
-file, so a wrong wiring, sign or unit changes no time.
-"""
+"""When annotated loads began to act: steps of the dots are matched with the notes in their order. Only the link's
+natural frequencies are taken from the rig file, so a wrong wiring, sign or unit changes no time."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Readings taken apart: a movement of the plate, and what no movement of a plate makes of them.
-
-P PSDs give 2P readings, a plate has three ways to move: 2P - 3 combinations of the readings show none of them, one of
-two PSDs.
-"""
+"""Readings taken apart: a movement of the plate, and the 2P - 3 combinations of P PSDs that no movement of a plate
+makes."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What hung on the link, if it is not what was noted: three numbers for each time between two changes of the load.
-
-A movement of the plate that another constant load makes, from one change to the next, is a wrong note. An effect of the
-catalogue moves the plate in proportion to the loads, more or less: so a few wrong notes stand out beside it. If all
-notes are wrong (rounded), other loads leave next to nothing of the movement.
-"""
+"""What hung on the link, if it is not what was noted: the constant load between two changes that moves the plate as it
+did. A few wrong notes stand out beside an effect, which acts in proportion to the loads."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of the dots that last: where they are, and when the load of each began to act.
-
-They are found without a model of the rig: the mean just after a moment against the mean just before it, over whole
-periods of the link's bending. The time is fitted with the ringing that follows and, if the load was applied slowly, the
-time that it took. Only the link's natural frequencies are taken from the rig file.
-"""
+"""Steps of the dots that last, by means over whole bending periods on either side of a moment, and when each load began
+to act: fitted with the ringing that follows. Only natural frequencies are taken from the rig file."""
 
 from __future__ import annotations
 

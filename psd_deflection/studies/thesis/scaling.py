@@ -1,13 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Appendix B: how two links, one carrying the other, deflect when they are scaled.
-
-A flexible link BC is clamped at B; a rigid link CD of the same length is attached at right angles
-to its tip; a force P at D bends BC by P L^3/3EI and twists it by P L_CD L/GJ, and the twist moves D
-by another L_CD sin(theta). Each cell of the appendix's tables is compared: either the value
-computed from the stated modulus rounds to the printed value, or the cell is an erratum with a
-reason.
-"""
+"""Appendix B: a flexible link BC, clamped at B, carries a rigid CD at right angles under a force P at D. Each printed
+cell is what the stated modulus gives, or an erratum with its reason."""
 
 from __future__ import annotations
 

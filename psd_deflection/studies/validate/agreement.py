@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What two instruments that measured the same motion differ by.
-
-Bland and Altman (Lancet 327, 307, 1986): differences over means, the bias and the limits within which 95 % of the
-differences lie. Beside it the differences are split into bias, scale and noise: the reference is regressed on the
-estimate, because the estimate is the less noisy of the two, and a noisy cause would shrink the slope.
-"""
+"""What two instruments that measured the same motion differ by: bias and 95 % limits (Bland and Altman, Lancet 327,
+307, 1986), and scale and noise by regression of the reference on the estimate, the less noisy of the two."""
 
 from __future__ import annotations
 

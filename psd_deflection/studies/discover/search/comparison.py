@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measured against simulated, as whitened vectors of one likelihood: what the search asks of a rig or of another plant.
-
-:class:`~psd_deflection.studies.discover.search.workspace.Workspace` is the rig with its recordings,
-:class:`~psd_deflection.studies.discover.plant_search.PlantComparison` any machine that simulates itself. Search, refit,
-hold-out and verdict know neither.
-"""
+"""Measured against simulated, as whitened vectors of one likelihood: what search, refit, hold-out and verdict ask of
+the rig with its recordings or of any machine that simulates itself."""
 
 from __future__ import annotations
 

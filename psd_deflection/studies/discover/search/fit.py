@@ -1,11 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Full nonlinear refit of a set of effects: Levenberg-Marquardt on the whitened residual, bounded.
-
-It does not use scipy.optimize.least_squares for three reasons. Every simulation must be counted and
-shared. The Jacobian at the optimum is reused for the covariance, the hold-out and the next
-screening. Steps are taken in each parameter's own scale.
-"""
+"""Bounded Levenberg-Marquardt refit of effects on the whitened residual. scipy's least_squares neither counts and
+shares simulations nor keeps the Jacobian for covariance and hold-out."""
 
 from __future__ import annotations
 

@@ -1,14 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Where the simulation and the data differ: by channel, load case and frequency band.
-
-There are two kinds of statistics on a whitened residual. *Cells*: energy per channel, load case and
-frequency band, in standard deviations above noise. The null distribution is a parametric bootstrap
-of the maximum over all cells; it accounts for the base model's fitted parameters by projection (a
-refit to first order). *Dependence*: how much of each channel follows a regressor (loads, their rate
-and history, dot position, temperature, time). It shows what the discrepancy depends on, and whether
-the dependence is odd or even.
-"""
+"""Where simulation and data differ: energy per channel, load case and frequency band against a bootstrap of the largest
+cell, and how much of each channel follows a regressor (loads, rate, history, dot position, temperature, time)."""
 
 from __future__ import annotations
 

@@ -1,13 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What predicts, beside what is named: the terms of the library weighed together, each by how likely it is.
-
-Names need proof, a prediction does not: of many small terms none may stand out, and together they still lower the error
-on unseen cases. Each subset of the terms is a model of normal sizes (Zellner and others' spike and slab, George and
-McCulloch 1993), noise and number of terms being free. The tempered Gibbs sampler (Zanella and Roberts 2019) walks over
-the subsets; the mean of their sizes is the predictive model, which so is shrunk. The error on unseen cases is nested:
-terms and sizes are chosen anew without the cases that judge them.
-"""
+"""What predicts, beside what is named: each subset of the library's terms weighed (spike and slab, George and McCulloch
+1993; tempered Gibbs sampler, Zanella and Roberts 2019) and the mean taken. The error on unseen cases is nested: terms
+and sizes are chosen anew without the cases that judge them."""
 
 from __future__ import annotations
 

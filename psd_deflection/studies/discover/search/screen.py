@@ -1,12 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Score tests: how much of a residual each effect's signature explains by itself.
-
-With whitened signatures M and residual r, g = M'r and F = M'M; the part that parameters already in
-the model (columns J) can explain is projected out. The gain of a candidate is T = g'F^-1 g over its
-own columns: the drop of chi-square if it were added, to first order; under "nothing missing" it is
-chi-square with as many degrees of freedom as columns.
-"""
+"""Score tests: with whitened signatures M, residual r, g = M'r and F = M'M beside the columns in the model, a
+candidate's gain is T = g'F^-1 g: the drop of chi-square to first order; with nothing missing, chi-square of as many
+columns."""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Chooses the effects: add greedily, add pairs, drop, swap, with a full refit each time.
-
-The search scores every candidate on the residual (this takes milliseconds), refits the few most
-promising, and keeps the best by BIC if it passes. If a residual remains after the first effect, it
-also tries the best pairs of the linear screen. At the end it drops effects that are no longer
-significant.
-"""
+"""Chooses the effects by BIC: adds the best of the linear screen, adds pairs, drops, swaps, with a full refit each
+time."""
 
 from __future__ import annotations
 

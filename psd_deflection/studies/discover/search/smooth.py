@@ -1,12 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What remains without a name as one smooth function of named variables, beside the named effects.
-
-A Gaussian process (Rasmussen and Williams 2006, chapter 2): a sum of one function for each variable, in each channel,
-with the sizes of the named effects free beside it (universal kriging). How large and how smooth it is, and the noise,
-are those of the largest restricted likelihood (Patterson and Thompson 1971). scipy's interpolators have no free sizes
-beside them and no likelihood. A case is predicted by sizes and a function that were found without it.
-"""
+"""What remains without a name as one smooth function: a Gaussian process over named variables (Rasmussen and Williams
+2006) beside free sizes of the named effects (universal kriging), by restricted likelihood (Patterson and Thompson
+1971)."""
 
 from __future__ import annotations
 

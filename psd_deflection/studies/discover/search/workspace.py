@@ -1,12 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings and simulations as whitened vectors of one common likelihood.
-
-Samples are first averaged over *fine blocks* of a few milliseconds (short enough for the link's
-motion, and a recording becomes four times smaller). Then they are whitened by the noise model, so
-half the squared length of a residual vector is its negative log-likelihood. All simulations are run
-and counted here.
-"""
+"""Recordings and simulations as whitened means of a few milliseconds, so that half the squared length of a residual is
+its negative log-likelihood. All simulations are run and counted here."""
 
 from __future__ import annotations
 
