@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.records import Counts, DeflectionEstimate, ParameterChange, RawChunk, Record, SpotMeans
+from psd_deflection.records import Counts, ParameterChange, RawChunk, Record, SpotMeans
 
 COUNT = 10.0 / 32768
 """V a count of the rig file's converter."""
@@ -22,11 +22,6 @@ def chunk(readings: Counts | npt.NDArray[np.floating], first: int = 0) -> RawChu
     if readings.dtype.kind == 'i':
         return RawChunk(seq, seq * 1_000_000, readings.astype(np.int32), flags, COUNT)
     return RawChunk(seq, seq * 1_000_000, readings.astype(np.float32), flags)
-
-
-def primaries(records: Iterable[Record]) -> list[DeflectionEstimate]:
-    """The estimates of the primary solver."""
-    return [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
 
 
 def spots(records: Iterable[Record]) -> list[SpotMeans]:

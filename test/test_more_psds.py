@@ -11,13 +11,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.stats import chi2
 
 from msg_adapters import point_cloud2, to_messages
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.model.plate import Geometry
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.read.readers import open_recording
@@ -36,7 +34,6 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run.session_texts import zero_text
-from test.oracles import RayPlane
 
 Counts = npt.NDArray[np.int32]
 Spoil = Callable[[Counts], None]
@@ -117,37 +114,6 @@ def test_a_gap_and_a_psd_without_a_place_are_rejected_by_name(values: dict[str, 
 def test_what_is_made_for_two_is_rejected(three: Rig, changes: dict[str, object], words: str) -> None:
     with pytest.raises(PsdDeflectionError, match=words):
         Pipeline(replace_values(three, changes))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('solver', 'more', 'pose', 'unknowns'),
-    [
-        ('pose', {}, (1.2e-3, -1.8e-3, 0.01, 4e-3, 3e-3), 5),
-        ('pose', FOURTH, (-0.5e-3, 1.0e-3, -0.01, -2e-3, 1e-3), 5),
-        ('exact', {**LEVEL, 'psd_4.center': [0.05, 0.06]}, (1.2e-3, -1.8e-3, 0.02, 0.0, 0.0), 3),
-        ('beam', {}, (0.9e-3, -1.5e-3, 0.01, 1.5 * 1.5e-3 / 0.585, 1.5 * 0.9e-3 / 0.585), 3),
-    ],
-)
-def test_errors_are_those_of_the_covariance(
-    three: Rig, rays: RayPlane, solver: str, more: dict[str, object], pose: tuple[float, ...], unknowns: int
-) -> None:
-    rig = with_solver(three, solver, **more)
-    dots = rays.tip_dots(Geometry.from_rig(rig), pose)
-    found = primaries(list(Pipeline(rig).process(chunk_of(at_rest(rig, dots, 20 * 400, 11)))))[100:]
-    errors = np.array([e.pose for e in found]) - pose[:3]
-    covariances = np.array([e.covariance for e in found]).reshape(-1, 3, 3)
-    squares = np.einsum('ni,nij,nj->n', errors, np.linalg.inv(covariances), errors)
-    # 300 blocks: a mean of 3 within four of its standard deviations, and the tail of a chi-square.
-    assert len(found) == 300
-    assert squares.mean() == pytest.approx(3.0, abs=4.0 * (6.0 / 300) ** 0.5)
-    assert np.mean(squares < chi2.isf(0.05, 3)) > 0.95 - 4.0 * (0.05 * 0.95 / 300) ** 0.5
-    freedom = 2 * len(rig.psds) - unknowns
-    redundant = np.array([e.chi_square for e in found])
-    assert redundant.mean() == pytest.approx(freedom, abs=4.0 * (2.0 * freedom / 300) ** 0.5)
-    if unknowns == 5:
-        tilts = np.array([(e.phi, e.omega) for e in found]).mean(axis=0)
-        assert tilts == pytest.approx(pose[3:], abs=2e-5)
 
 
 FAILS = 1800
@@ -264,13 +230,6 @@ def test_one_degree_of_freedom_blames_no_psd(three: Rig, psd: int) -> None:
     assert_inside(records, truth)
     assert pipeline.estimator.contradictions > 60
     assert pipeline.estimator.most_likely_wrong() == ''
-
-
-@pytest.mark.slow
-def test_a_stuck_psd_reports_on_itself_where_the_check_cannot(three: Rig) -> None:
-    records, truth, _ = run(three, stuck(1))
-    assert_inside(records, truth)
-    assert [s.excluded for s in spots_of(records)].count((2,)) > 70
 
 
 def test_frozen_psd_is_not_the_psd_that_contradicts(three: Rig) -> None:
@@ -432,19 +391,6 @@ def test_a_zero_is_of_all_psds(three: Rig) -> None:
     assert [e.pose for e in primaries(list(pipeline.process(chunk_of(counts, 600))))][-1] == pytest.approx(
         (0.0, 0.0, 0.0), abs=5e-6
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('solver', 'more'), [('pose', {}), ('exact', LEVEL)])
-def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: str, more: dict[str, object]) -> None:
-    """A twist by a degree moves every combination of the dots; what the model leaves of them stays noise."""
-    rig = with_solver(three, solver, **more)
-    ringing = loads.steps([(0.0, -30.0, -10.0), (10.0, 10.0, 5.0), (0.0, 0.0, 0.0)], 1.0)
-    pipeline = Pipeline(rig)
-    list(pipeline.process(chunk_of(RigSimulator(rig, 4).step(ringing.loads).counts)))
-    assert pipeline.estimator.noise_source() == 'measured in motion'
-    assert pipeline.estimator.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
-    assert pipeline.estimator.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.3)
 
 
 STUDIES: dict[str, list[str]] = {

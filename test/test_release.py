@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import shutil
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -71,36 +70,11 @@ def test_the_tree_as_it_is_has_no_problem() -> None:
             'actions/checkout@v4 is not pinned by the SHA of a commit',
         ),
         (lambda root: (root / 'LICENSE').unlink(), 'LICENSE: missing'),
-        (
-            lambda root: (root / 'psd_deflection/base/page/vendor/uPlot.LICENSE').unlink(),
-            'what is not ours has no licence beside it',
-        ),
-        (
-            lambda root: change(root / 'package.xml', 'https://psd-deflection.org/<', 'https://psd-deflection.invalid/<'),
-            'package.xml: an address ends with .invalid',
-        ),
-        (lambda root: change(root / 'setup.cfg', 'url = https', 'url = ftp'), 'setup.cfg: stale'),
         (lambda root: change(root / 'CITATION.cff', 'version: 0', 'version: 9'), 'CITATION.cff: stale'),
-        (lambda root: change(root / 'CHANGELOG.rst', 'Measuring', 'Measured'), 'CHANGELOG.rst: stale'),
-        (lambda root: change(root / 'package.xml', '<version>', '<version>9'), 'package.xml: version 9'),
         (lambda root: change(root / 'CHANGELOG.md', '(2026-12-01)', '(unreleased)'), 'unreleased; a release has'),
-        (lambda root: change(root / 'CHANGELOG.md', '## 0', '## 9'), 'CHANGELOG.md: no entry for'),
-        (
-            lambda root: change(root / 'packaging/rosdep_keys.csv', 'python3-yaml,apt', 'python3-yaml,none'),
-            'key python3-yaml has no row for noble',
-        ),
-        (
-            lambda root: change(root / 'docs/dependencies.md', '| python3-zstandard |', '| none yet |'),
-            'package.xml: lacks zstandard, for which rosdep has no key yet',
-        ),
     ],
-    ids=[
-        'a key of pip', 'an action that can be moved', 'no licence', 'no licence of what is not ours',
-        'an address that leads nowhere', 'another address',
-        'a stale citation', 'a stale changelog', 'another version', 'no date',
-        'no entry', 'a key without a row', 'no key',
-    ],
-)  # fmt: skip
+    ids=['a key of pip', 'an action that can be moved', 'no licence', 'a stale citation', 'no date'],
+)
 def test_what_a_release_must_not_have_is_reported(
     tree: Path,
     sabotage: Callable[[Path], object],
@@ -115,15 +89,3 @@ def test_what_a_release_must_not_have_is_reported(
     assert main(['check'], tree) == 1
     found = [line for line in capsys.readouterr().out.splitlines() if line.startswith('PROBLEM: ')]
     assert any(message in line for line in found), found
-
-
-def packed(wheel: Path, without: str = '\0') -> Path:
-    """A wheel with the files of the tree, but those that have ``without`` in their names."""
-    with zipfile.ZipFile(wheel, 'w') as archive:
-        for package in ('psd_deflection', 'msg_adapters'):
-            for path in (ROOT / package).rglob('*'):
-                if path.is_file() and '__pycache__' not in str(path) and without not in str(path):
-                    archive.write(path, str(path.relative_to(ROOT)))
-        archive.writestr('x.dist-info/licenses/LICENSE', '')
-        archive.writestr('x.data/data/share/psd_deflection/package.xml', '')
-    return wheel

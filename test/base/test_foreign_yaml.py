@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import math
 from pathlib import Path
@@ -14,7 +13,6 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-import psd_deflection
 from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError
 from psd_deflection.base.foreign_yaml import MAX_DEPTH, MAX_NODES, YamlError, edited, parse_yaml
@@ -169,7 +167,6 @@ def test_numbers_are_written_again_to_the_last_bit(value: float, digits: int) ->
         assert parse_yaml(edited(text, lambda tree: None)) == parse_yaml(text)
 
 
-PACKAGE = Path(psd_deflection.__file__).parent
 ODD = ['-1_0', '1_000', '٣', '１', '0x10', '1e', '', 'one', '1 2']
 
 
@@ -207,24 +204,3 @@ def test_parameters_options_loads_frames_and_arms_reject_it(text: str, tmp_path:
     with pytest.raises(ConfigError, match='must be 1 finite number'):
         read_arm(urdf, 'tool')
     assert main(['load', '--url', 'http://127.0.0.1:1/', '--', '0', text, '0']) == 2
-
-
-def _readings(node: ast.AST) -> list[ast.expr]:
-    """Where a text may become a number: as the type of an option; ``float(x)`` if ``x`` may be none (ValueError)."""
-    if isinstance(node, ast.keyword) and node.arg == 'type' and _is_reader(node.value):
-        return [node.value]
-    if not isinstance(node, ast.Try) or not any(h.type and 'ValueError' in ast.unparse(h.type) for h in node.handlers):
-        return []
-    calls = [n for statement in node.body for n in ast.walk(statement) if isinstance(n, ast.Call) and n.args]
-    of_map = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == 'map' and _is_reader(c.args[0])]
-    direct = [c for c in calls if _is_reader(c.func) and not _is_checked(node, c)]
-    return [*of_map, *direct]
-
-
-def _is_reader(node: ast.expr) -> bool:
-    return isinstance(node, ast.Name) and node.id == 'float'
-
-
-def _is_checked(attempt: ast.Try, call: ast.Call) -> bool:
-    """Whether the same attempt reads the text by ``plain_number`` before."""
-    return 'plain_number' in ast.unparse(attempt) and 'isinstance' in ast.unparse(attempt)

@@ -16,14 +16,14 @@ import pytest
 from blind.render import Pose, Scene, board, developed
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera import boards
-from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.answer import Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.print_target import printed
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import SETTINGS, TARGETS, CameraSettings, target_class
-from psd_deflection.camera.target import Drawing, Target, target_of
+from psd_deflection.camera.target import Target, target_of
 
 SCENE = Scene(width=640, height=480, focal=2000.0, centre=(325.0, 236.0), distance=0.42)
 MOVED = Pose(2e-3, -1e-3, math.radians(2.0), 0.02, -0.01)
@@ -88,22 +88,6 @@ def test_every_size_in_the_settings_is_of_some_kind() -> None:
     own = {f'{SETTINGS.parameters[name].name}' for kind in TARGETS for name in target_class(kind).own}
     sizes = {p.name for p in SETTINGS.parameters.values() if p.name.startswith('target.')}
     assert sizes - own == {'target.kind'}
-
-
-class Cross(Target):
-    """A kind that finds nothing, or something everywhere."""
-
-    kind = 'cross'
-    own = ()
-    everywhere = False
-
-    def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
-        if self.everywhere:
-            return TargetPose(np.eye(3), np.array([0.0, 0.0, 1.0]), np.eye(6), 0.0, 1, np.zeros((1, 2)))
-        raise NoPoseError(Status.MISSING)
-
-    def drawing(self) -> Drawing:
-        return Drawing((0.05, 0.05), discs=((0.0, 0.0, 0.01),))
 
 
 SMALL = Scene(width=400, height=320, focal=1000.0, centre=(195.0, 162.0), distance=0.25, distortion=(-0.1, 0.05))

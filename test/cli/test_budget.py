@@ -19,13 +19,6 @@ from psd_deflection.studies.budget.inputs import INPUTS
 RIG = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
 
 
-SMALL = """\
-link: {length: 0.8, outer_radius: 0.006, inner_radius: 0.0045, youngs_modulus: 2.0e11, shear_modulus: 8.0e10}
-    psd_1: {center: [0.0, 0.05], active_area: [0.004, 0.004], zero: [0.0005, -0.0005]}
-    psd_2: {center: [-0.06, 0.0]}
-"""
-
-
 @pytest.mark.slow
 def test_a_rig_without_room_says_which_dot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / 'rig.yaml'

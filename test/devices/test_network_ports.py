@@ -156,39 +156,6 @@ def test_a_real_rejection(listener: socket.socket) -> None:
         open_port(name, BAUD)
 
 
-@pytest.mark.parametrize('end', ['given up', 'too late'])
-def test_a_connection_that_does_not_come_is_not_waited_for(
-    end: str, listener: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is closed if it comes after all."""
-    begun, go_on, made = threading.Event(), threading.Event(), []
-    connect = socket.create_connection
-
-    def slowly(place: tuple[str, int], _: float) -> socket.socket:
-        begun.set()
-        assert go_on.wait(WAIT_S)
-        made.append(connect(place))
-        return made[0]
-
-    monkeypatch.setattr(socket, 'create_connection', slowly)
-    given_up = threading.Event()
-    if end == 'given up':
-
-        def give_up() -> None:
-            begun.wait(WAIT_S)
-            given_up.set()
-
-        threading.Thread(target=give_up).start()
-        text = 'given up'
-    else:
-        monkeypatch.setattr(tcp_port, 'CONNECT_S', 0.0)
-        text = 'no answer in'
-    with pytest.raises(DeviceError, match=text):
-        open_port(named(listener), BAUD, given_up=given_up)
-    go_on.set()
-    until(lambda: bool(made) and made[0].fileno() == -1)
-
-
 def test_no_thread_is_left_for_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     def reject(**_: object) -> threading.Thread:
         raise RuntimeError("can't start new thread")
@@ -196,17 +163,6 @@ def test_no_thread_is_left_for_a_connection(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(threading, 'Thread', reject)
     with pytest.raises(DeviceError, match=r"socket://rig:4000: cannot be opened \(can't start new thread"):
         open_port('socket://rig:4000', BAUD)
-
-
-def test_over_ipv6() -> None:
-    try:
-        listener = socket.create_server(('::1', 0), family=socket.AF_INET6)
-    except OSError:
-        pytest.skip('this machine has no IPv6')
-    with listener:
-        port = open_port(f'socket://[::1]:{listener.getsockname()[1]}', BAUD)
-        listener.accept()[0].close()
-        port.close()
 
 
 class Datagrammed:

@@ -13,12 +13,9 @@ import numpy as np
 import pytest
 import yaml
 from mcap.writer import CompressionType, IndexType, Writer
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.typesys import Stores, get_typestore
 
 import psd_deflection
-from msg_adapters import LOAD, MESSAGE_TYPES, RIG, SAMPLES, to_messages
+from msg_adapters import MESSAGE_TYPES, RIG, SAMPLES, to_messages
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
@@ -37,7 +34,6 @@ from psd_deflection.rig.config import load_rig
 
 from .making import HELLO, STEP, T0, assert_same, block, run, write_mcap
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 
 
@@ -317,41 +313,6 @@ def test_other_layouts_compressions_and_no_chunks(
     recording = open_recording(tmp_path / 'a.mcap')
     assert_same(list(recording.blocks()), expected)
     assert (recording.complete, recording.parameters, recording.hello) == (True, {}, None)
-
-
-@pytest.mark.slow
-def test_a_bag_that_rosbags_wrote_is_read(tmp_path: Path) -> None:
-    types = STORE.types
-    header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
-    expected = [block(i, lost=(1,) if i % 3 == 0 else ()) for i in range(60)]
-    with RosbagsWriter(tmp_path / 'theirs', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        samples = writer.add_connection(SAMPLES, 'sensor_msgs/msg/PointCloud2', typestore=STORE)
-        load = writer.add_connection(LOAD, 'geometry_msgs/msg/WrenchStamped', typestore=STORE)
-        for b in expected:
-            (m,) = to_messages(b)
-            f = m.fields
-            t = int(b.t_ns[0])
-            stamp = header(time(t // 10**9, t % 10**9), 'link_tip')
-            points = types['sensor_msgs/msg/PointCloud2'](
-                stamp,
-                1,
-                f['width'],
-                [types['sensor_msgs/msg/PointField'](**field) for field in f['fields']],
-                False,
-                f['point_step'],
-                f['row_step'],
-                np.frombuffer(f['data'], np.uint8),
-                True,
-            )
-            writer.write(samples, t, STORE.serialize_cdr(points, 'sensor_msgs/msg/PointCloud2'))
-        vector = types['geometry_msgs/msg/Vector3']
-        wrench = types['geometry_msgs/msg/Wrench'](vector(1.0, 2.0, 0.0), vector(0.0, 0.0, 3.0))
-        known = types['geometry_msgs/msg/WrenchStamped'](header(time(5, 6), 'link_tip_rest'), wrench)
-        writer.write(load, T0, STORE.serialize_cdr(known, 'geometry_msgs/msg/WrenchStamped'))
-    recording = open_recording(tmp_path / 'theirs')
-    assert_same(list(recording.blocks()), expected)
-    assert recording.loads() == [AppliedLoad(5_000_000_006, 1.0, 2.0, 3.0)]
-    assert recording.topics() == {SAMPLES: 60, LOAD: 1}
 
 
 @pytest.mark.slow

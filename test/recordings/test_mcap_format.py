@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +19,6 @@ from mcap.writer import CompressionType, Writer
 from psd_deflection.recordings.mcap_format import RECORD_HEAD, Channel, DamagedError, Metadata, Opcode, Schema, parsed
 from psd_deflection.recordings.write.mcap_writer import McapWriter
 
-BAGS = sorted((Path(__file__).parent.parent.parent / 'bags').glob('*/*.mcap'))
 TEXTS = st.text(max_size=8)
 U16, U32, U64 = (st.integers(0, 2**bits - 1) for bits in (16, 32, 64))
 SCHEMAS = st.builds(Schema, id=U16, name=TEXTS, encoding=TEXTS, data=st.binary(max_size=9))

@@ -65,23 +65,6 @@ sys.exit(main())
 """
 """Our program, which waits longer for a first answer of its device than any test does."""
 
-HANGING_DISK = """
-import sys
-from pathlib import Path
-from psd_deflection.cli.main import main
-from psd_deflection.run import recorder
-new_folder = recorder.new_folder
-def hanging(parent):
-    answer = parent.parent / 'answer'
-    if answer.exists():
-        answer.read_text()
-        answer.unlink()
-    return new_folder(parent)
-recorder.new_folder = hanging
-sys.exit(main())
-"""
-"""Our program, whose disk hangs at the first recording until somebody writes to the named pipe ``answer``."""
-
 
 @pytest.fixture
 def start(domain: int) -> Iterator[Callable[..., Program]]:

@@ -39,7 +39,6 @@ from test.ros.conftest import BLOCK_NS, stamp
 
 pytestmark = pytest.mark.ros
 
-MS = 1_000_000
 
 TOPICS = {
     '/link_tip/deflection': 'geometry_msgs/msg/PoseStamped',

@@ -22,12 +22,10 @@ from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import null_log, texts
-from psd_deflection.base.sequence import SequenceExtender, Step
 from psd_deflection.cli.main import main
 from psd_deflection.devices.protocol.frames import HelloFrame, SampleFrame
 from psd_deflection.devices.protocol.words import MAX_TEXT
-from psd_deflection.devices.registry import make_source
-from psd_deflection.devices.source import Event, Received, Source, SourceEndedError
+from psd_deflection.devices.source import Received, Source
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import CHANNELS, channel_names
 from psd_deflection.rig.config import Rig, load_rig
@@ -337,20 +335,3 @@ def test_a_restart_is_recorded_and_no_command_invents_a_loss(bag: Path, capsys: 
     assert 'restarts     4 of the device' in text
     # Numbers that belong to no sample are few: other readers see less than two blocks of them at each restart.
     assert np.diff(open_recording(bag).samples['seq']).max() < 40
-
-
-def test_recorded_restart_is_one_on_device_replay(bag: Path) -> None:
-    source = make_source(load_rig(overrides={'source': 'replay', 'port': str(bag), 'replay.stamps': 'recorded'}))
-    source.open(2.0)
-    source.start()
-    events: list[Event] = []
-    with contextlib.suppress(SourceEndedError):
-        while True:
-            events += source.read(10.0).events
-    sequence = SequenceExtender(20)
-    steps = [sequence.extend(e.seq, e.t) for e in events]  # type: ignore[union-attr]
-    assert sum(missing for _, _, missing in steps) == 0
-    assert sum(step is Step.RESTART for _, step, _ in steps) == 4
-    assert [number - steps[0][0] for number, _, _ in steps] == (
-        open_recording(bag).samples['seq'] - open_recording(bag).samples['seq'][0]
-    ).tolist()

@@ -11,13 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, HelloRequestFrame, PingFrame, encode
-from psd_deflection.devices.rig_feed import RigFeed
-from psd_deflection.devices.serve import open_sockets, serve
 from psd_deflection.rig.config import Rig, load_rig
 from test.heard import WAIT_S
 from test.run.conftest import HELLO, ScriptedDevice
@@ -259,21 +255,3 @@ def test_text_lines_are_never_put_together_of_two_datagrams() -> None:
     finally:
         run.acquisition.stop()
         sender.end()
-
-
-@pytest.fixture(params=['socket', 'udp'])
-def served(request: pytest.FixtureRequest) -> Iterator[str]:
-    """The port of the simulated rig behind a port of the network, in real time."""
-    kind = socket.SOCK_STREAM if request.param == 'socket' else socket.SOCK_DGRAM
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind(('127.0.0.1', 0))
-        place = f'{request.param}://127.0.0.1:{free.getsockname()[1]}'
-    stop = threading.Event()
-    known = load_rig()
-    twin = SimulatedFrames(RigFeed(known, lambda first, n: np.tile([0.0, -10.0, 0.0], (n, 1)), seed=1))
-    with open_sockets(place, 1) as (port,):
-        thread = threading.Thread(target=serve, args=(twin, port, stop.is_set), daemon=True)
-        thread.start()
-        yield port.name
-        stop.set()
-        thread.join()

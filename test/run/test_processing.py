@@ -83,22 +83,6 @@ def test_a_request_that_was_begun_is_waited_for(items: ItemQueue, monkeypatch: p
     processing.join(WAIT_S)
 
 
-def test_timeout_of_a_begun_request_says_that_it_was_begun(items: ItemQueue, monkeypatch: pytest.MonkeyPatch) -> None:
-    processing, held = Processing(items, Pipeline(load_rig()), texts(print)), Held()
-
-    def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
-        assert held.begun.wait(WAIT_S)
-        return wait(asked, 0.0)
-
-    monkeypatch.setattr(module, 'wait', impatient)
-    processing.start()
-    with pytest.raises(TimeoutError, match='it was begun and has not ended'):
-        processing.request(held)
-    held.go_on.set()
-    items.put(Ended())
-    processing.join(WAIT_S)
-
-
 def test_errors_of_a_request_come_through(items: ItemQueue) -> None:
     def reject() -> None:
         raise TimeoutError('its own')

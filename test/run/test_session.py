@@ -8,7 +8,6 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
@@ -213,29 +212,6 @@ def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -
     assert 0 <= mark.t_ns - (before - 8_000_000_000) <= passed
     assert 0 <= load.t_ns - (before - 6_000_000_000) <= passed
     assert later.t_ns == load.t_ns + 1
-
-
-@pytest.mark.parametrize(
-    ('values', 'simulated', 'info', 'kept'),
-    [
-        ({}, False, {'serial': 'A-1'}, 'history_A-1.sqlite'),
-        ({}, True, {'serial': 'A-1'}, ''),
-        ({'source': 'replay', 'port': 'a.csv'}, False, {'serial': 'A-1'}, ''),
-        ({}, False, {}, ''),
-        ({}, False, None, ''),
-    ],
-)
-def test_the_hours_of_a_device_are_kept_by_its_serial_number(
-    values: dict[str, object], simulated: bool, info: dict[str, object] | None, kept: str
-) -> None:
-    hello = None if info is None else SimpleNamespace(info=info)
-    session = SimpleNamespace(
-        rig=load_rig(overrides=values), simulated=simulated, acquisition=SimpleNamespace(hello=hello)
-    )
-    shown = ShownSession.__new__(ShownSession)
-    shown._session = session  # type: ignore[assignment]
-    found = shown.history_file()
-    assert (found.name if found is not None else '') == kept
 
 
 def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:

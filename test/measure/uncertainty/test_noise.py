@@ -210,10 +210,6 @@ def test_undithered_rounding_stays_as_error(sigma: float) -> None:
     assert undithered(1.0, 0.0) == 0.0
 
 
-def steps_of(stated: float, step: float) -> FloatArray:
-    return np.asarray(StreamNoise(SIZE, PLACES, PLACES, stated, step).gamma[0, 0])
-
-
 def test_each_reading_has_its_own_steps_and_noise() -> None:
     of = StreamNoise(SIZE, PLACES, PLACES, 1e-12 * np.arange(1.0, 5.0), 1e-6 * np.arange(4.0))
     for c in range(4):

@@ -7,7 +7,6 @@ The effect is the one of docs/simulation.md, "Add an effect", so that the page i
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import subprocess
@@ -192,29 +191,6 @@ def test_a_package_offers_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(FOLDERS, '')
     assert Pipeline(load_rig(overrides=EFFECT)).needs_temperature
-
-
-LINK = {'bending_stiffness', 'torsional_stiffness', 'damping'}
-"""Effects that have the name of what they change; it is a word of mechanics and of the fit as well."""
-
-
-def words_of(path: Path) -> list[tuple[int, str]]:
-    """Identifiers and the text of strings, with their lines, docstrings aside."""
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    prose = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)}
-    out: list[tuple[int, str]] = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose:
-            out.append((node.lineno, node.value))
-        elif isinstance(node, ast.Name):
-            out.append((node.lineno, node.id))
-        elif isinstance(node, ast.Attribute):
-            out.append((node.lineno, node.attr))
-        elif isinstance(node, ast.keyword | ast.arg) and node.arg is not None:
-            out.append((node.lineno, node.arg))
-        elif isinstance(node, ast.ImportFrom):
-            out += [(node.lineno, f'{node.module} {alias.name}') for alias in node.names]
-    return out
 
 
 HEAVY = ('scipy.signal', 'scipy.special', 'scipy.optimize', 'scipy.stats', 'matplotlib', 'pandas')

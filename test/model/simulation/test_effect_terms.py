@@ -20,7 +20,7 @@ from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import Reading, State, Traced
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 
 COUNT = 9
@@ -95,13 +95,6 @@ def light(s: SimulatedSamples, v: Values) -> Rows:
     sums = s.sums.copy()
     sums[psd - 1] = total
     return {'dots': of_psd(s.dots, psd, change), 'sums': sums}
-
-
-def hum(s: SimulatedSamples, v: Values) -> Rows:
-    out = s.volts.copy()
-    for row, name in enumerate(CHANNELS):
-        out[row] += v[f'amplitude_{name}'] * np.sin(2 * np.pi * v['frequency'] * s.t + v[f'phase_{name}'])
-    return {'volts': out}
 
 
 def test_impossible_reading_is_corrected_to_finite_value() -> None:

@@ -324,27 +324,6 @@ def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Se
     assert page.complaints() == []
 
 
-@pytest.mark.slow
-def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
-    page.open(address_of(start('monitor', str(BAGS / 'clean'), '--http-port', '0', '--speed', '0.05')))
-    page.until('!document.getElementById("seek").disabled')
-    page.driver.find_element(By.ID, 'pause').click()
-    page.until('document.getElementById("state").textContent === "paused"')
-    assert page.js('document.getElementById("pause").textContent') == 'Play'
-    before = page.rows()
-    page.js('(() => { const s = document.getElementById("seek"); s.value = 3; s.onchange(); })()')
-    page.until('document.getElementById("position").textContent.startsWith("3.0 of 4.0 s")')
-    page.until(f'document.body.dataset.rows > {before + 50}', 'the rows up to there')
-    page.js('(() => { const s = document.getElementById("seek"); s.value = 1; s.onchange(); })()')
-    page.until('document.getElementById("position").textContent.startsWith("1.0 of 4.0 s")')
-    for button in ('record', 'load', 'mark'):
-        page.driver.find_element(By.ID, button).click()
-        page.until('document.getElementById("notice").textContent.startsWith("a recording is played; it")')
-    page.driver.find_element(By.ID, 'pause').click()
-    page.until('document.getElementById("state").textContent === "playing"')
-    assert page.complaints() == []
-
-
 WARM_BLOCKS = 75_600
 """Until then the engine compiles and recompiles what runs often: 150 kB more than after 36 000 blocks, 20 kB less than
 after 144 000."""

@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
-import signal
 import stat
 import subprocess
 import sys
@@ -18,9 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection import simulate
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.records import BlockStatus
 from psd_deflection.run.monitor import client
 from psd_deflection.run.monitor.served import Served, announce, served_pages
@@ -91,37 +87,6 @@ def test_zero_waits_for_a_link_that_moves(
 
 
 CALIBRATE = ['calibrate', '--live', '--params-file', str(ROOT / 'config' / 'thesis_rig.yaml'), '--out']
-
-
-def test_a_stop_of_the_calibration_is_never_lost(
-    serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Python drops an exception that a signal raises in a callback of the garbage collector."""
-    bag, out = tmp_path / 'bag', tmp_path / 'out'
-    made = simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29)], seconds=1, seed=4)
-    convert(made, bag, made.parameters, Beside.of(made), made.blocks())
-    serving = serve()
-    serving.shown.folder = str(bag)
-    asked, reported = itertools.count(1), client.recording_of
-
-    class Leaving:
-        def __del__(self) -> None:
-            os.kill(os.getpid(), signal.SIGTERM)
-            # The signal is taken between two steps of Python.
-            sum(range(10))
-
-    def recording_of(daemon: client.Daemon) -> str | None:
-        if next(asked) == 3:
-            Leaving()
-        return reported(daemon)
-
-    monkeypatch.setattr(client, 'recording_of', recording_of)
-    monkeypatch.setattr('os.nice', lambda more: more)
-    before = signal.getsignal(signal.SIGTERM)
-    assert main([*CALIBRATE, str(out)]) == 0
-    assert signal.getsignal(signal.SIGTERM) == before
-    assert serving.shown.recordings == [str(bag), None]
-    assert {path.name for path in out.iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
 
 
 def test_calibrate_needs_the_recording_on_this_machine(
@@ -220,9 +185,6 @@ def test_without_a_daemon_the_error_says_how_to_start_one(
     assert 'http://127.0.0.1:9/: no daemon answers (' in output
     assert 'psd-deflection estimator --monitor' in output
     assert output.count('\n') == 1
-
-
-HEAVY = ('scipy', 'aiohttp', 'matplotlib', 'ruamel')
 
 
 @pytest.mark.parametrize('text', ['-1,5', '1_0', 'ten'])

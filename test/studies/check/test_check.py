@@ -132,29 +132,6 @@ def test_a_right_rig_is_accused_of_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    'effects',
-    [
-        [{'name': 'bending_stiffness', 'scale': -0.4}, {'name': 'torsional_stiffness', 'scale': 0.5}],
-        [{'name': 'load_direction', 'angle': 0.3}],
-        [{'name': 'load_offset', 'x': 0.02, 'y': -0.02}],
-        [{'name': 'sensor_rotation', 'psd': 2, 'angle': 0.2}],
-        [{'name': 'sensor_gain', 'psd': 1, 'x': 0.15, 'y': -0.15}],
-        [{'name': 'axis_crosstalk', 'psd': 1, 'xy': 0.2, 'yx': -0.1}],
-        [{'name': 'mains_interference', 'frequency': 50.0, 'amplitude': [5e-3] * 6, 'phase': [0.0] * 6}],
-        [{'name': 'laser_pointing_drift', 'psd': 1, 'rate_x': 2e-6, 'rate_y': -2e-6}],
-    ],
-    ids=lambda effects: effects[0]['name'],
-)
-def test_a_right_wiring_beside_other_mistakes_is_not_accused(effects: list[Any]) -> None:
-    loads = pushes(50.0)
-    for seed in range(3):
-        found = checked(recorded(loads, seed, effects=effects), loads)
-        assert found.verdict == RIGHT, found.findings
-        assert not found.values
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize('channel', ['x1', 'y1', 'x2', 'y2'])
 @pytest.mark.parametrize('stuck', [False, True])
 def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> None:

@@ -109,17 +109,6 @@ def test_hum_is_the_amplitude_of_the_mains_that_stands_out_more() -> None:
     assert (hz, hum.tolist()) == (50.0, [0.0] * 6)
 
 
-def transform(volts: FloatArray, rate: float, hz: float) -> FloatArray:
-    """Amplitude (6,) under a Hann window, term by term."""
-    n = len(volts)
-    window = [0.5 - 0.5 * math.cos(2.0 * math.pi * i / (n - 1)) for i in range(n)]
-    about = volts - volts.mean(axis=0)
-    turns = [2.0 * math.pi * hz * i / rate for i in range(n)]
-    real = sum(w * math.cos(a) * row for w, a, row in zip(window, turns, about, strict=True))
-    imaginary = sum(w * math.sin(a) * row for w, a, row in zip(window, turns, about, strict=True))
-    return np.asarray(2.0 * np.hypot(real, imaginary) / sum(window))
-
-
 @pytest.mark.parametrize(('noise', 'observed'), [(0.0195, True), (0.0205, False)])
 def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, observed: bool) -> None:
     volts = waves(4000, 1000.0, {50.0: 5e-3})

@@ -40,19 +40,6 @@ def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
     return discover([Observation('x', RIG, volts, annotated)])
 
 
-@pytest.mark.slow
-def test_amplifier_lag_is_found_beside_fitted_times() -> None:
-    """All times a little later leave of a lag only what bends; and they are settled again beside it."""
-    annotated = np.tile(LEVELS[0], (len(HELD), 1))
-    for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
-        annotated[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    found = searched(read(HELD, effects__e__name='amplifier_lag', effects__e__time_constant=4e-4), annotated)
-    assert [e.active.effect.name for e in found.effects] == ['amplifier_lag']
-    assert found.effects[0].active.values['time_constant'] == pytest.approx(4e-4, rel=0.1)
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.1
-
-
 OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 

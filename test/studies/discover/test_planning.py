@@ -64,17 +64,6 @@ def plan(models: tuple[Workspace, Fit, Fit]) -> Plan:
     return planned
 
 
-@pytest.mark.slow
-def test_it_is_reported_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
-    workspace, named, alternative = models
-    plan = plan_next(workspace, named, [alternative], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
-    assert plan is not None
-    assert not plan.useful
-    assert plan.sentence.startswith('No recording within the limits would tell bending_stiffness')
-    assert plan.discriminations[0].possible < SEPARATES
-    assert plan_next(workspace, named, []) is None
-
-
 def test_what_pieces_show_adds_up_to_what_the_recording_shows(models: tuple[Workspace, Fit, Fit]) -> None:
     workspace, named, alternative = models
     short = Setting('', {'link.length': 0.4})

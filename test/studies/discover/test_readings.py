@@ -74,21 +74,6 @@ def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
-def test_tables_of_two_lengths_report_stiffness_from_the_clamp() -> None:
-    found = discover_in(ReadingsPlant([read([SOFT]), read([SOFT], length=0.4, seed=1)]))
-    (effect,) = found.effects
-    assert (effect.active.effect.name, effect.equivalent) == ('bending_stiffness', ())
-    assert effect.active.values['scale'] == pytest.approx(-0.05, abs=0.002)
-
-
-@pytest.mark.slow
-def test_estimates_show_rotated_sensor_unlike_poses() -> None:
-    found = discover_in(ReadingsPlant([read([ROTATED], 'estimates')], without=['axis_crosstalk']))
-    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 2)']
-    assert discover_in(ReadingsPlant([read([ROTATED], 'poses')])).verdict == 'nothing_missing'
-
-
-@pytest.mark.slow
 def test_one_effect_on_both_psds_is_simulated_for_both() -> None:
     gains = [make_active('sensor_gain', {'psd': psd, 'y': 0.01}, 'test') for psd in (1, 2)]
     plant = ReadingsPlant([read([])])

@@ -147,19 +147,6 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     assert 'The set-up is not as' in found.sentence
 
 
-@pytest.mark.slow
-def test_zero_of_second_recording_is_named_with_it() -> None:
-    second = dataclasses.replace(recorded(seed=2), name='second')
-    shift = np.array([0.3, -0.2, 0.0, 0.1, 0.4, 0.0])
-    found = found_in(recorded(), changed(second, lambda volts: volts + shift))
-    assert found.verdict == 'nothing_missing'
-    assert [(f.name, f.where) for f in found.setup] == [('zero', 'second')]
-    assert found.setup[0].fix.startswith('overrides of second: psd_1.zero: [0.000')
-    (fitted,) = [a for a in found.fit.effects if a.effect.name == 'zero']
-    volts = [fitted.values[n] / RIG.amplifier.sensitivity for n in ('x1', 'y1', 'x2', 'y2')]
-    assert volts == pytest.approx([0.3, -0.2, 0.1, 0.4], abs=1e-3)
-
-
 def test_a_jump_is_found_at_its_sample() -> None:
     o = recorded()
     o.volts[2600:, 0] += 0.02
@@ -184,15 +171,6 @@ def test_outliers_are_excluded_and_movement_is_kept(share: float) -> None:
     # Neither a step of the load nor hum of a hundred times the noise.
     t = np.arange(len(o.volts))[:, None] / 1000.0
     assert not outliers(o.volts + 0.2 * np.sin(2.0 * np.pi * 50.0 * t), 5e-4).any()
-
-
-@pytest.mark.slow
-def test_a_recording_may_start_under_load_and_in_motion() -> None:
-    o = recorded()
-    cut = dataclasses.replace(o, volts=o.volts[1100:], loads=o.loads[1100:])
-    found = found_in(cut)
-    assert (found.verdict, found.setup) == ('nothing_missing', ())
-    assert found.floors < 1.05
 
 
 def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None = None) -> Path:

@@ -191,15 +191,6 @@ def test_missing_loads_are_excluded_until_next_note() -> None:
 
 
 @pytest.mark.slow
-def test_two_loads_that_were_not_noted_are_reported_one_by_one() -> None:
-    annotated = SHORT_HELD.copy()
-    annotated[2 * SHORT_DWELL : 4 * SHORT_DWELL] = MANY_LEVELS[1]
-    effective = effective_loads(RIG, VOLTS, annotated)
-    assert [n.name for n in effective.notes] == ['missing_load', 'missing_load']
-    assert np.isfinite(effective.volts).all()
-
-
-@pytest.mark.slow
 def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
     effective = effective_loads(RIG, VOLTS, np.zeros_like(SHORT_HELD))
     assert not effective.notes

@@ -171,10 +171,6 @@ def test_a_step_without_a_note_has_its_time() -> None:
     assert correct_loads(RIG, dots, annotated_as(2, (0, -20, 0))) is None
 
 
-def reported(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
-    return [(p.first, p.last, p.number, p.unannotated) for p in listed]
-
-
 def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
     annotated = acting.copy()
