@@ -65,22 +65,6 @@ def test_a_rig_by_names_and_maps() -> None:
     assert repr(psd_deflection.load_rig()) == '<Rig of the thesis>'
 
 
-def test_a_replay_gives_what_was_published() -> None:
-    recording = psd_deflection.open(CLEAN)
-    estimates = psd_deflection.replay(recording)
-    published = recording.estimates()['/link_tip/deflection_with_covariance']
-    assert published.covariance is not None
-    assert estimates.covariance is not None
-    assert np.array_equal(estimates.t_ns, published.t_ns)
-    assert np.array_equal(estimates.pose[:, :2], published.pose[:, :2])
-    assert np.allclose(estimates.theta, published.pose[:, 2], rtol=0.0, atol=1e-17)
-    assert np.array_equal(estimates.covariance, published.covariance)
-    assert estimates.wrench is not None
-    assert np.all(np.isfinite(estimates.wrench))
-    assert len(estimates) == 200
-    assert estimates.t[0] == pytest.approx(0.0095)
-
-
 def test_a_replay_with_another_rig_and_blocks() -> None:
     rig = psd_deflection.load_rig(block_size=40)
     assert len(psd_deflection.replay(str(CLEAN), rig)) == 100

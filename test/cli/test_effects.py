@@ -47,20 +47,6 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
     assert found['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
 
 
-def test_what_is_corrected_is_reported() -> None:
-
-    corrected = {
-        name: catalogue()[name].corrected for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')
-    }
-    assert corrected == {
-        'plane_tilt': 'reading',
-        'refraction': 'reading',
-        'creep': 'wrench',
-        'bending_stiffness': 'wrench',
-    }
-    assert catalogue()['amplifier_lag'].corrected == ''
-
-
 def test_a_wrong_name_is_reported_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['effects', 'sensor_rotatoin']) == 2
     assert 'did you mean sensor_rotation' in capsys.readouterr().err

@@ -143,16 +143,6 @@ def test_convert_there_and_back_keeps_every_bit(bag: Path, tmp_path: Path, capsy
     assert 'exists already' in capsys.readouterr().err
 
 
-def test_convert_notes_the_rig_that_it_is_given(bag: Path, tmp_path: Path) -> None:
-    (tmp_path / 'rig.yaml').write_text('/**:\n  ros__parameters:\n    sum_min: 0.5\n')
-    assert main(['convert', str(bag), '--out', str(tmp_path / 'a.mcap')]) == 0
-    assert open_recording(tmp_path / 'a.mcap').parameters['sum_min'] == 1.5
-    assert open_recording(tmp_path / 'a.mcap').hello == HELLO
-    out = str(tmp_path / 'b.mcap')
-    assert main(['convert', str(bag), '--out', out, '--params-file', str(tmp_path / 'rig.yaml')]) == 0
-    assert open_recording(out).parameters['sum_min'] == 0.5
-
-
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 

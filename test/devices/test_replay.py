@@ -79,16 +79,6 @@ def test_it_takes_as_long_as_the_recording_and_stamps_with_now() -> None:
     assert samples[-1].t == pytest.approx(clock.t_ns, abs=1_000_000)
 
 
-def test_nothing_comes_before_it_is_due() -> None:
-    source, clock = replay(BAGS / 'clean')
-    assert len(source.read(0.1).events) == 20
-    at = clock.t_ns
-    assert source.read(0.005).events == []
-    assert clock.t_ns == at + 5_000_000
-    assert len(source.read(0.1).events) == 20
-    assert clock.t_ns == pytest.approx(at + 20_000_000, abs=100_000)
-
-
 def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     rows = ''.join(f'{i / 1000:.3f},0.1,0.2,5,0.3,0.4,5\n' for i in range(100))
     path = tmp_path / 'run.csv'

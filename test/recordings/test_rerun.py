@@ -117,17 +117,6 @@ def test_a_loss_breaks_every_line(tmp_path: Path) -> None:
     assert 101 not in lost
 
 
-@pytest.mark.usefixtures('stand_in')
-def test_a_dot_without_light_is_taken_away(tmp_path: Path) -> None:
-    rows = rows_of('laser_off', tmp_path / 'a.rrd')
-    dark = [n for n in (1, 2) if any(row is None for _, row in rows[f'psd_{n}/plane/dot'])]
-    assert len(dark) == 1
-    (number,) = dark
-    times = {t for t, row in rows[f'sums/psd_{number}'] if row is not None and row[0] < 2.5}
-    assert len(times) > 10
-    assert not times & {t for t, row in rows[f'psd_{number}/plane/dot'] if row is not None}
-
-
 def test_times_of_a_csv_are_since_its_start(stand_in: MagicMock, tmp_path: Path) -> None:
     assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.csv')]) == 0
     text = (tmp_path / 'a.csv').read_text().splitlines()

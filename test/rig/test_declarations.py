@@ -151,16 +151,6 @@ def test_effects_stay_with_a_rig_that_is_changed() -> None:
     assert changed.flat() == {**rig.flat(), 'effects.one.psd': 2, 'link.length': 0.5}
 
 
-def test_one_message_for_a_file_and_for_an_override(tmp_path: Path) -> None:
-    path = tmp_path / 'mine.yaml'
-    path.write_text('/**:\n  ros__parameters:\n    converter: {full_scale: -1}\n')
-    why = r'converter\.full_scale = -1 V: must be above 0 and at most 1000$'
-    with pytest.raises(ConfigError, match=rf'mine\.yaml: {why}'):
-        load_rig(path)
-    with pytest.raises(ConfigError, match=rf'^override: {why}'):
-        load_rig(RIG, {'converter.full_scale': -1})
-
-
 def test_what_another_rig_leaves_as_in_the_thesis_is_reported() -> None:
     assert left_as_in_the_thesis(load_rig().values) == ()
     # A parameter that measures nothing of the rig makes it no other one.

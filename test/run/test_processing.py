@@ -141,15 +141,3 @@ def test_latency_is_last_byte_to_last_sink(items: ItemQueue) -> None:
     assert reported(processing) == (20, 20)
     clock.now = 3000 * MS
     assert reported(processing) is None
-
-
-@pytest.mark.parametrize('blocks', [10, 400])
-def test_a_second_is_a_second_however_many_blocks_it_has(items: ItemQueue, blocks: int) -> None:
-    """The worst is the first: a fixed number of blocks would forget it, or remember it for too long."""
-    every = 2000 // blocks
-    ends = [5000 + every * i for i in range(blocks)]
-    slow = blocks // 2 + 1
-    processing, clock = after(items, [(end - (90 if i == slow else 3), end) for i, end in enumerate(ends)])
-    assert reported(processing) == (3, 90)
-    clock.now = (ends[slow] + 1001) * MS
-    assert reported(processing) == (3, 3)

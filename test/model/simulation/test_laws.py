@@ -19,7 +19,6 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import FORMS, TARGETS, Law, LawTerm, effect_of, law_text, unit_of, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
-from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.study import described
 
@@ -216,37 +215,9 @@ def test_a_malformed_law_is_rejected_with_file_and_key(tmp_path: Path, change: d
     assert str(error.value).startswith(f'{file}: {message}')
 
 
-def test_every_form_has_a_sound_unit() -> None:
-    # A coefficient times its form has the unit of what it acts on: doubled variables in halved units change nothing.
-    values: FloatArray = np.linspace(-1e-3, 1e-3, 50)
-    for form in set(FORMS) - {'jitter', 'switched'}:
-        term = law_of(form).terms[0]
-        shapes = {k: 1e3 * v if term.shape_unit(k) == 'm' else v for k, v in term.shapes.items()}
-        scaled = LawTerm(form, term.of, 1.0, shapes)
-        a = term.evaluate(lambda _: values, 50, 1e-3, {})
-        b = scaled.evaluate(lambda _: 1e3 * values, 50, 1e-3, {})
-        np.testing.assert_allclose(b, 1e3 ** FORMS[form].unit_of_v * a, rtol=1e-9, atol=1e-15, err_msg=form)
-
-
 LOAD = Law('both', 'load', 'load_fx', (LawTerm('product', ('load_fy',), 0.02), LawTerm('product', ('load_tz',), 0.01)))
 DOT = Law('both', 'psd', 'y2', (LawTerm('above', ('y1',), 0.1, {'threshold': 1.2e-4}),))
 JOINT = Law('both', 'load', 'load_fx', LOAD.terms, 'a base that yields', (DOT,))
-
-
-def test_one_cause_on_two_quantities_is_one_law() -> None:
-    (joint,) = active(JOINT)
-    assert [p.name for p in joint.effect.parameters] == ['c1', 'c2', 'c3', 'threshold3']
-    assert (joint.effect.stage, joint.effect.needs) == ('load', 'load_fy, load_tz, y1')
-    assert joint.effect.equation == f'{LOAD.expression}; {DOT.expression}'
-    together = ForwardModel(RIG, [joint]).run(LOADS).volts
-    apart = ForwardModel(RIG, [*active(LOAD), *active(DOT)]).run(LOADS).volts
-    np.testing.assert_array_equal(together, apart)
-    # A rig file may say other sizes, of the whole.
-    half = ActiveEffect(joint.effect, {**joint.values, 'c1': 0.01, 'c2': 0.0, 'c3': 0.0})
-    less = Law('less', 'load', 'load_fx', (LawTerm('product', ('load_fy',), 0.01),))
-    np.testing.assert_array_equal(
-        ForwardModel(RIG, [half]).run(LOADS).volts, ForwardModel(RIG, active(less)).run(LOADS).volts
-    )
 
 
 def test_a_joint_law_is_one_file(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.model.simulation.catalogue import catalogue, make_active, with_effects
+from psd_deflection.model.simulation.catalogue import make_active, with_effects
 from psd_deflection.model.simulation.simulator import RigSimulator
-from psd_deflection.records import channel_names, dot_names
+from psd_deflection.records import dot_names
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
@@ -74,18 +74,6 @@ def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: 
     dark = RigSimulator(SIX).step(LOADS).counts
     assert np.flatnonzero(np.any(lit != dark, axis=0)).tolist() == [8]
     assert make_active('lifts', {'c1': 1.0}, 'test').effect.least_psds == 4
-
-
-def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
-    for psds in (2, 3, 6):
-        names = [p.name for p in catalogue(psds)['mains_interference'].parameters]
-        sizes, phases = ([f'{of}_{c}' for c in channel_names(psds)] for of in ('amplitude', 'phase'))
-        assert names == ['frequency', *sizes, *phases]
-        rotated = catalogue(psds)['sensor_rotation']
-        assert [v['psd'] for v in rotated.variants(psds)] == list(range(1, psds + 1))
-    assert [e.name for e in catalogue().values()] == [e.name for e in catalogue(6).values()]
-    with pytest.raises(ConfigError, match='amplitude_x3'):
-        with_effects(TWO, ['mains_interference,amplitude_x3=0.01'], 'test')
 
 
 def test_a_crossed_wiring_goes_to_the_device_and_back() -> None:
