@@ -1,13 +1,12 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The shaper over real DDS: trajectories and goals in, the same shaped, and what it says of them back."""
+"""The shaper's action over real DDS: goals in, the same to the controller, shaped, and what it says of them back."""
 
 from __future__ import annotations
 
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -18,16 +17,11 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from bench.shapers import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played
 from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving
 from psd_deflection.ros.endpoints import GuardedServer
 from test.ros.conftest import WARNINGS, Peer
@@ -36,8 +30,8 @@ from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
 
-JOINTS = ('shoulder', 'elbow')
-BEGIN = np.array([0.3, -0.2])
+NAMES = ('shoulder', 'elbow')
+START = np.array([0.3, -0.2])
 WORDS = ('--frequency', '12', '--shaper', 'zvd', '--action', ACTION)
 SUCCEEDED, CANCELED, ABORTED = GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED
 FOLLOW = '/shaper/follow_joint_trajectory'
@@ -60,15 +54,15 @@ class Arm:
         peer.until(self.client.server_is_ready, 'the action of the shaper')
 
     def serving(self) -> ServedController:
-        return ServedController(self.peer.node, JOINTS, TrajectoryController(BEGIN))
+        return ServedController(self.peer.node, NAMES, TrajectoryController(START))
 
     def _step(self) -> None:
         now = self.peer.node.get_clock().now().nanoseconds / 1e9
-        at = BEGIN
+        at = START
         if self.controller is not None:
             self.controller.step(now)
             at = self.controller.controller.state(now)[0]
-        self._out.publish(JointState(name=list(JOINTS), position=at.tolist()))
+        self._out.publish(JointState(name=list(NAMES), position=at.tolist()))
 
     def ready(self) -> None:
         """The shaper has found the controller, and the joints."""
@@ -78,7 +72,7 @@ class Arm:
         observed = {s.name: s for r in self.reports for s in r.status if s.name.startswith('shaper: ')}
         return len(observed) == 2 and all(s.level == DiagnosticStatus.OK for s in observed.values())
 
-    def goal(self, end: tuple[float, ...] = (0.5, 0.1), seconds: float = 0.3, names: tuple[str, ...] = JOINTS) -> Any:
+    def goal(self, end: tuple[float, ...] = (0.5, 0.1), seconds: float = 0.3, names: tuple[str, ...] = NAMES) -> Any:
         at = Duration(nanoseconds=round(1e9 * seconds)).to_msg()
         point = JointTrajectoryPoint(time_from_start=at, positions=list(end), velocities=[0.0] * len(end))
         return self.action.Goal(trajectory=JointTrajectory(joint_names=list(names), points=[point]))
@@ -104,7 +98,7 @@ class Arm:
     def moves(self) -> bool:
         assert self.controller is not None
         at = self.controller.controller.state(self.peer.node.get_clock().now().nanoseconds / 1e9)[0]
-        return bool(np.abs(at - BEGIN).max() > 0.02)
+        return bool(np.abs(at - START).max() > 0.02)
 
 
 @pytest.fixture(scope='session')
@@ -145,15 +139,15 @@ def test_goal_is_shaped_with_result_of_controller(begin: Callable[..., Arm]) -> 
     assert (status, result.error_code, result.error_string) == (SUCCEEDED, 0, 'Goal successfully reached!')
     assert arm.controller is not None
     (sent,) = arm.controller.goals
-    begun, path = arriving(sent.trajectory, JOINTS)
-    assert np.allclose(path.states[0, 0], BEGIN, atol=1e-9)
+    begun, path = arriving(sent.trajectory, NAMES)
+    assert np.allclose(path.states[0, 0], START, atol=1e-9)
     assert path.states[-1, 0].tolist() == [0.5, 0.1]
     assert path.duration == pytest.approx(0.3 + 0.0834, abs=1e-3)
     assert begun > 0.0
     assert sent.path_tolerance == goal.path_tolerance
     assert sent.goal_tolerance == goal.goal_tolerance
     assert sent.goal_time_tolerance == goal.goal_time_tolerance
-    assert arm.feedback[-1].feedback.joint_names == list(JOINTS)
+    assert arm.feedback[-1].feedback.joint_names == list(NAMES)
     assert len(arm.feedback[-1].feedback.actual.positions) == 2
 
 
@@ -168,7 +162,7 @@ def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Callable[..
     assert (old.status, old.result.error_code) == (ABORTED, -1)
     assert 'preempted' in old.result.error_string
     assert arm.controller is not None
-    (t0, one), (t1, two) = (arriving(goal.trajectory, JOINTS) for goal in arm.controller.goals)
+    (t0, one), (t1, two) = (arriving(goal.trajectory, NAMES) for goal in arm.controller.goals)
     # It begins where the one before it is then, and as fast.
     here = one.at(np.array([t1 - t0]))[0]
     np.testing.assert_allclose(two.states[0, :2], here, atol=1e-5)
@@ -189,7 +183,7 @@ def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Callable[...,
     arm.peer.until(lambda: len(arm.reports) > reports, 'a second')
     status, _ = arm.followed(arm.goal())
     assert status == SUCCEEDED
-    _, path = arriving(arm.controller.goals[-1].trajectory, JOINTS)
+    _, path = arriving(arm.controller.goals[-1].trajectory, NAMES)
     np.testing.assert_allclose(path.states[0], [held, [0.0, 0.0]], atol=1e-9)
 
 
@@ -383,152 +377,3 @@ def test_an_action_that_cannot_be_is_rejected(
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr
     assert why in ended.stderr
-
-
-ZVD = ('--frequency', str(FREQUENCY), '--damping-ratio', str(RATIO), '--shaper', 'zvd')
-URDF = ROOT / 'config' / 'two_links.urdf'
-
-
-@pytest.fixture
-def node(domain: int) -> Iterator[Program]:
-    one = Program([*PSD_DEFLECTION, 'shaper', *ZVD], env={'PYTHONWARNINGS': WARNINGS})
-    yield one
-    status = one.end()
-    print(*one.lines[-50:], sep='\n')
-    assert status == 0
-
-
-def message(*points: JointTrajectoryPoint, names: tuple[str, ...] = NAMES) -> JointTrajectory:
-    return JointTrajectory(joint_names=list(names), points=list(points))
-
-
-def point(seconds: float, positions: list[float]) -> JointTrajectoryPoint:
-    at = Duration(nanoseconds=round(1e9 * seconds)).to_msg()
-    return JointTrajectoryPoint(time_from_start=at, positions=positions, velocities=[0.0] * len(positions))
-
-
-def reported(peer: Any, **positions: float) -> None:
-    """Let joints be told again and again."""
-    out = peer.node.create_publisher(JointState, '/joint_states', 5)
-    stated = JointState(name=list(positions), position=list(positions.values()))
-    peer.node.create_timer(0.02, lambda: out.publish(stated))
-
-
-def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> None:
-    node.until('publishing /shaper/shaped: ZVD for 12 Hz, damping ratio 0.02; motions take 83 ms longer')
-    heard = peer.collect(JointTrajectory, '/shaper/shaped')
-    reports = peer.collect(DiagnosticArray, '/diagnostics')
-    given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
-    peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
-    peer.until(lambda: peer.node.count_publishers('/shaper/shaped') > 0, 'its answers')
-
-    unknown = 'nobody tells where the joints are on joint_states'
-    peer.until(lambda: any(r.status[0].message == unknown for r in reports), 'diagnostics without joints')
-    given.publish(message(point(0.0, [0.0]), names=('z',)))
-    node.until('trajectory rejected: the position of z is not known')
-    reported(peer, shoulder=START[0], elbow=START[1])
-    given.publish(message(point(0.0, [1.0])))
-    node.until('trajectory rejected: point 0 has 1 positions, must be 2')
-    late = message(point(0.0, START.tolist()))
-    late.header.stamp.sec = 1
-    given.publish(late)
-    node.until('trajectory rejected: its stamp is .* s old')
-    peer.until(lambda: any('was rejected: its stamp' in r.status[0].message for r in reports), 'diagnostics')
-
-    good = message(point(0.0, START.tolist()), point(MOVE_S, END.tolist()))
-    good.points[0].effort = [0.0, 0.0]
-    # Shaped: stamp and frame are kept, and the link is at rest when the joints are.
-    begun = time.time_ns()
-    good.header.stamp = peer.node.get_clock().now().to_msg()
-    good.header.frame_id = 'arm'
-
-    def answered() -> bool:
-        # The first one may leave before DDS has connected both ways.
-        if not heard:
-            good.header.stamp = peer.node.get_clock().now().to_msg()
-            given.publish(good)
-        return bool(heard)
-
-    peer.until(answered, 'the shaped trajectory')
-    shaped = heard[0]
-    assert shaped.joint_names == list(NAMES)
-    assert shaped.header.frame_id == 'arm'
-    assert stamp(shaped) >= begun + 100_000_000
-    assert list(shaped.points[0].positions) == START.tolist()
-    assert list(shaped.points[-1].positions) == END.tolist()
-    times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in shaped.points]
-    arrived = checked(NAMES, times, [[p.positions, p.velocities, p.accelerations] for p in shaped.points])
-    assert arrived.duration == pytest.approx(MOVE_S + 0.0834, abs=1e-3)
-    assert played(arrived) < 0.05 * played(move())
-    reports.clear()
-    peer.until(lambda: any('ZVD for 12 Hz' in r.status[0].message for r in reports), 'diagnostics')
-    values = {v.key: v.value for v in reports[-1].status[0].values}
-    assert (values['shaper'], values['delay (s)'], values['trajectories rejected']) == ('zvd', '0.0834', '3')
-
-    # With another one of its name each motion would come twice: both reject.
-    twin = peer.node.create_publisher(JointTrajectory, '/shaper/shaped', 5)
-    reports.clear()
-    held = 'it shapes nothing: another node publishes /shaper/shaped'
-    peer.until(lambda: any(held == r.status[0].message for r in reports), 'a second publisher')
-    good.header.stamp = peer.node.get_clock().now().to_msg()
-    given.publish(good)
-    node.until('trajectory rejected: another node publishes /shaper/shaped')
-    peer.node.destroy_publisher(twin)
-
-    heard.clear()
-    given.publish(message())
-    peer.until(lambda: any(not h.points for h in heard), 'the stop')
-
-
-@pytest.mark.slow
-def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> None:
-    words = [*ZVD, '--urdf', 'robot_description']
-    node = Program([*PSD_DEFLECTION, 'shaper', *words], env={'PYTHONWARNINGS': WARNINGS})
-    try:
-        given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
-        heard = peer.collect(JointTrajectory, '/shaper/shaped')
-        peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
-        reported(peer, shoulder=START[0], elbow=START[1])
-        move_of = {'slow': (2.0 * MOVE_S, END.tolist()), 'far': (MOVE_S, [1e3, 0.0])}
-
-        def rejected(why: str, kind: str) -> None:
-            good = message(point(0.0, START.tolist()), point(*move_of[kind]))
-            peer.until(lambda: given.publish(good) or why in node.text, why)
-
-        rejected('trajectory rejected: nobody has told the limits of the joints on robot_description yet', 'slow')
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        described = peer.node.create_publisher(String, '/robot_description', latched)
-        described.publish(String(data='<robot'))
-        peer.until(lambda: 'robot_description: rejected' in node.text, 'a rejection of what is no URDF')
-        described.publish(String(data=URDF.read_text()))
-        peer.until(lambda: 'limits of shoulder, elbow' in node.text, 'the limits')
-        rejected('trajectory rejected: shoulder', 'far')
-        good = message(point(0.0, START.tolist()), point(*move_of['slow']))
-        peer.until(lambda: given.publish(good) or bool(heard), 'the shaped trajectory')
-    finally:
-        assert node.end() == 0
-    print(node.text)
-
-
-def test_settings_are_parameters(node: Program, peer: Any) -> None:
-    node.until('publishing /shaper/shaped')
-    asked = GetParameters.Request(names=['shaper', 'frequency', 'max_step', 'lead'])
-    kind, frequency, step, lead = peer.call(GetParameters, '/shaper/get_parameters', asked).values
-    assert (kind.string_value, frequency.double_value) == ('zvd', FREQUENCY)
-    assert (step.double_value, lead.double_value) == (0.05, 0.1)
-
-    def changed(name: str, value: float) -> Any:
-        new = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=new)])
-        return peer.call(SetParameters, '/shaper/set_parameters', request).results[0]
-
-    assert changed('max_step', 0.01).successful
-    assert not changed('max_step', -1.0).successful
-    assert not changed('frequency', 10.0).successful
-    given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
-    peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
-    reported(peer, shoulder=0.0, elbow=0.02)
-    peer.until(
-        lambda: given.publish(message(point(0.0, [0.0, 0.0]))) or 'from where elbow is' in node.text, 'a rejection'
-    )
-    assert 'must be at most 0.01' in node.text
