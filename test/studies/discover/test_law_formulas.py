@@ -23,6 +23,7 @@ from psd_deflection.studies.discover.search.fit import Fit, heldout_gap, refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
 from .test_formulas import RIG, make_observation
+from .test_rules import FINE, SIGMA, A, Plant, active
 
 
 @pytest.fixture(scope='module')
@@ -475,6 +476,16 @@ def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(laws, 'score', lambda *_: weak)
     seeker = Given({})
     assert len(seeker.first()) == 1
+
+
+def test_a_law_shows_where_it_has_a_twentieth_of_its_energy() -> None:
+    shown = {A: np.zeros((6, FINE))}
+    shown[A][[0, 1, 4]] = SIGMA * np.array([[0.5], [3.0], [1.0]])
+    plant = Plant(shown, shown[A])
+    fit = refit(plant, [active('a', x=0.5)])
+    best = cast(laws.LawTrial, SimpleNamespace(fit=fit, beside=()))
+    # Of 10.25 parts they have 0.25, 9 and 1.
+    assert laws.dominant_channels(plant, best) == ('y1', 'y2')
 
 
 def test_a_law_shows_alike_at_other_stages() -> None:

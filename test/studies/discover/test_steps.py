@@ -26,6 +26,7 @@ from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
 from psd_deflection.studies.discover.search.localise import dependences, localise, regressors
 from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import Search, mistake
+from psd_deflection.studies.discover.search.trials import far
 from psd_deflection.studies.discover.search.weighing import coincidences
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, load_sizes, movement_sums, noise_energy
@@ -139,6 +140,12 @@ def test_effects_beside_late_loads_are_simulated_anew(late: float, again: bool) 
     null = refit(plant, ())
     assert mistake(search, null, search.screen.score(null.residual)) is null
     assert [named(fit) for fit in beside if fit] == [['load_delay']] * again
+
+
+def test_a_fit_is_far_beyond_ten_a_value() -> None:
+    fit = refit(Plant(pictures(A), noise()), ())
+    for more, is_far in ((0.0, False), (0.1, True)):
+        assert far(dataclasses.replace(fit, chi2=10.0 * 6 * FINE + more)) is is_far
 
 
 def test_another_sample_rate_is_tried_from_afar() -> None:
