@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,15 +12,21 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
+from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs import find_discs
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
 from psd_deflection.camera.opencv import declared_size
 from psd_deflection.camera.reference import CameraReference, mean_pose, relative, relative_covariance
+from psd_deflection.camera.refine_corners import refined
+from psd_deflection.camera.rim_classifier import sectors_of
+from psd_deflection.camera.rim_model import Shape, moved, rotation_matrix
 from psd_deflection.camera.settings import CameraSettings, settings_from
+from psd_deflection.camera.target import target_of
 from psd_deflection.records import FloatArray
 from test.altered import altered
 
@@ -94,9 +101,126 @@ def test_sixteen_bits_are_in_the_order_that_is_reported() -> None:
     assert of_ros_image(2, 2, 'yuv422', False, 4, bytes(8)) is None
 
 
+@pytest.mark.parametrize('kind', range(1, 7))
+def test_each_of_six_portable_formats_has_its_size(kind: int) -> None:
+    assert declared_size(f'P{kind} 53 37 255 '.encode()) == (53, 37)
+
+
+def test_a_rim_has_sixteen_parts_of_equal_angle() -> None:
+    angle = (np.arange(1600) + 0.5) * 2.0 * math.pi / 1600
+    side = (np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32))
+    parts = sectors_of(side, cast(Any, SimpleNamespace(begin=np.array([0, 1600]))))
+    assert np.bincount(parts).tolist() == [100] * 16
+    # Each part is of one piece.
+    assert np.count_nonzero(np.diff(parts)) == 15
+
+
+def test_a_fit_stays_within_its_bounds() -> None:
+    shape = Shape(np.eye(3), np.array([0.0, 0.0, 1.0]), 1.0, np.eye(2), np.zeros(4), np.zeros((3, 6)), np.zeros(2))
+    light, step = np.ones((3, 6)), np.zeros(16)
+    step[3:7], step[7:10], step[10:] = (0.1, 0.2, 0.3, 0.9), (2000.0, 0.0, -5.0), (-2.0, -1.2, 1.2, 2.0, 0.3, 0.4)
+    found = moved(shape, step, light)
+    assert found.place == pytest.approx([0.1, 0.2, 1.3])
+    assert found.swell == 1.4
+    # A quarter of a pixel is as sharp as it gets, 30 pixels as wide.
+    assert found.blur == pytest.approx(np.diag([900.0, 0.0625]))
+    assert (found.skew.tolist(), found.keystone.tolist()) == ([-1.5, -1.2, 1.2, 1.5], [0.3, 0.4])
+    assert moved(shape, -0.01 * np.ones(16), light).blur == pytest.approx(np.eye(2) - 0.01)
+    assert moved(shape, -step, light).swell == 0.7
+
+
+@pytest.mark.parametrize('view', ['outside', 'base'])
+def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
+    board = target_of(CameraSettings(target='charuco', view=view))
+    assert isinstance(board, Board)
+    plane = np.stack(np.meshgrid(np.linspace(-0.03, 0.03, 6), np.linspace(-0.04, 0.04, 8)), axis=-1).reshape(-1, 2)
+    facing = np.diag([1.0, -1.0, -1.0]) if view == 'outside' else np.eye(3)
+    true, at = facing @ rotation_matrix(np.array([0.2, -0.3, 0.4])), np.array([0.01, -0.02, 0.5])
+    observed = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
+    rotation, place = board.first_pose(plane, observed[:, :2] / observed[:, 2:])
+    assert rotation == pytest.approx(true, abs=1e-9)
+    assert place == pytest.approx(at, abs=1e-9)
+
+
+@pytest.mark.parametrize('crossing', [True, False])
+def test_corners_of_the_model_are_found_exactly(crossing: bool) -> None:
+    """Two corners of edges at 75 degrees, one brighter on its inside, one darker on a board; one is at the border."""
+    v, u = np.mgrid[:40, :70].astype(float)
+    true, blur = np.array([[20.3, 17.6], [50.1, 21.8], [3.0, 20.0]]), np.array([0.9, 1.3])
+    first, second = np.array([math.cos(0.2), math.sin(0.2)]), np.array([math.cos(1.5), math.sin(1.5)])
+    # Across each edge, to the side of the other.
+    n1 = np.array([second[1], -second[0]])
+    n2 = np.array([-first[1], first[0]])
+    image = np.zeros((40, 70))
+    for (x, y), contrast in zip(true[:2], (-60.0, 60.0 if crossing else -60.0), strict=True):
+        a, b = (((u - x) * n[0] + (v - y) * n[1]) / s for n, s in zip((n1, n2), blur, strict=True))
+        light = (2.0 * ndtr(a) - 1.0) * (2.0 * ndtr(b) - 1.0) if crossing else ndtr(a) * ndtr(b)
+        image = np.where(np.abs(u - x) < 15.0, 120.0 + contrast * light, image)
+    found = refined(image, np.round(true) + 0.2, np.tile([first, second], (3, 1, 1)), 6.5, crossing)
+    assert found.pixels[:2] == pytest.approx(true[:2], abs=1e-4)
+    assert found.blur[:2] == pytest.approx(np.tile(blur, (2, 1)), abs=1e-3)
+    assert found.misfit[:2] == pytest.approx(0.0, abs=1e-4)
+    assert np.isnan(found.pixels[2]).all()
+
+
+def discs_at(*places: tuple[float, float, float, float]) -> Any:
+    """White ellipses (x, y, half axes along x and y), px, on black: a grey level is a pixel's part in one."""
+    v, u = np.mgrid[: 200 * 4, : 300 * 4] / 4.0 - 0.375
+    white = np.any([((u - x) / a) ** 2 + ((v - y) / b) ** 2 < 1.0 for x, y, a, b in places], axis=0)
+    return (20.0 + 200.0 * white.reshape(200, 4, 300, 4).mean(axis=(1, 3))).astype(np.uint8)
+
+
+LINE = [(80.3, 60.1, 16.0, 20.0), (80.3, 110.1, 16.0, 20.0), (80.3, 160.1, 16.0, 20.0)]
+
+
+def test_drawn_discs_have_their_places_and_axes() -> None:
+    for x in (80.3, 281.3):
+        line = [(x, *rest) for _, *rest in LINE]
+        found = find_discs(discs_at(*line, (150.0, 20.0, 3.0, 3.0)), 2.5)
+        assert sorted(r.centre for r in found) == [pytest.approx(disc[:2], abs=0.1) for disc in line]
+        assert [r.axes for r in found] == [pytest.approx((16.0, 20.0), abs=0.2)] * 3
+        assert [r.shape for r in found] == [pytest.approx((256.0, 0.0, 400.0), abs=9.0)] * 3
+
+
+@pytest.mark.parametrize(
+    ('more', 'status'),
+    [
+        # As high as a fifth of a disc, and less; far away; two lines.
+        ((105.0, 110.0, 5.0, 5.0), Status.DOUBLED),
+        ((105.0, 110.0, 3.0, 3.0), None),
+        ((140.0, 110.0, 16.0, 20.0), None),
+        ((80.3, 10.1, 16.0, 9.0), None),
+    ],
+)
+def test_what_lights_a_rim_is_as_large_and_near(more: tuple[float, float, float, float], status: Status | None) -> None:
+    if status is None:
+        assert len(find_discs(discs_at(*LINE, more), 2.5)) == 3
+        return
+    with pytest.raises(NoPoseError) as rejected:
+        find_discs(discs_at(*LINE, more), 2.5)
+    assert rejected.value.status is status
+
+
+@pytest.mark.parametrize(('x', 'y'), [(16.0, None), (283.0, None), (None, 20.0), (None, 179.0)])
+def test_a_disc_at_the_border_is_none(x: float | None, y: float | None) -> None:
+    """Its rim is half a pixel within the image, then a tenth of one out of it."""
+    inwards = 1.0 if (x or y or 0.0) < 100.0 else -1.0
+    for inside in (0.5, -0.1):
+        to = inside * inwards
+        line = [(80.3 if x is None else x + to, 60.0 + 50.0 * k, 16.0, 20.0) for k in range(3)]
+        if y is not None:
+            line = [(80.3, y + to + inwards * 50.0 * k, 16.0, 20.0) for k in range(3)]
+        if inside > 0.0:
+            assert len(find_discs(discs_at(*line), 2.5)) == 3
+        else:
+            with pytest.raises(NoPoseError):
+                find_discs(discs_at(*line), 2.5)
+
+
 def test_a_lens_is_reported_with_the_deviation_of_each_number() -> None:
     matrix = np.array([[1000.0, 0.0, 320.0], [0.0, 1001.0, 240.0], [0.0, 0.0, 1.0]])
     made = Intrinsics((640, 480), matrix, np.array([1.0, 2.0, 3.0, 4.0]), np.zeros(5), 0.1, 12, [])
+    assert made.as_yaml('cam').startswith('image_width: 640\nimage_height: 480\ncamera_name: cam\ncamera_matrix:')
     assert made.lines() == ['focal length 1000.0 ± 1.0, 1001.0 ± 2.0 px', 'centre 320.0 ± 3.0, 240.0 ± 4.0 px']
 
 

@@ -153,6 +153,14 @@ def test_half_a_board_and_none_are_rejected() -> None:
         assert [a.status for a in reference.take(0, picture)] == [status]
 
 
+def test_tags_of_another_board_are_hidden_corners() -> None:
+    """Tags of the dictionary, of which the board has none."""
+    image = shot(SMALL, replace(TAGS, columns=4, rows=4, marker=0.012), Pose(), np.random.default_rng(3))
+    image[:, :255] = image[:110] = 128
+    (answer,) = CameraReference(replace(TAGS, columns=3, rows=3), target_of).take(0, image)
+    assert answer.status is Status.HIDDEN
+
+
 def test_the_lens_is_found_again() -> None:
     scene, rng = replace(SMALL, distance=0.16, distortion=(-0.15, 0.05)), np.random.default_rng(7)
     tilts = [(0.4, 0.0), (-0.4, 0.1), (0.0, 0.4), (0.1, -0.4), (0.3, 0.3), (-0.3, -0.3)]
