@@ -105,9 +105,7 @@ def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Gene
     return developed(scene, board(scene, pose, texture, target.size), rng)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('view', ['outside', 'base'])
-@pytest.mark.parametrize('settings', [BOARD, TAGS], ids=['charuco', 'apriltag'])
+@pytest.mark.parametrize(('settings', 'view'), [(BOARD, 'outside'), (TAGS, 'base')], ids=['charuco', 'apriltag'])
 def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
     scene, rng = replace(SMALL, view=view, turn=0.1), np.random.default_rng(3)
     settings = replace(settings, view=view, rest_frames=1)
