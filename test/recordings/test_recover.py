@@ -309,21 +309,21 @@ def readable(path: Path) -> list[SampleBlock]:
 
 
 @pytest.fixture(scope='module')
-def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    path = write_mcap(tmp_path_factory.mktemp('whole') / 'a.mcap', list(run(120)), device_hello=HELLO)
+def complete(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = write_mcap(tmp_path_factory.mktemp('complete') / 'a.mcap', list(run(120)), device_hello=HELLO)
     return path.read_bytes()
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(where=st.floats(0, 1))
-def test_everything_before_a_cut_is_read(tmp_path: Path, whole: bytes, where: float) -> None:
+def test_everything_before_a_cut_is_read(tmp_path: Path, complete: bytes, where: float) -> None:
     path = tmp_path / 'cut.mcap'
-    cut = int(where * (len(whole) - 1))
-    path.write_bytes(whole[:cut])
+    cut = int(where * (len(complete) - 1))
+    path.write_bytes(complete[:cut])
     expected = [r for r in run(120) if isinstance(r, SampleBlock)]
     got = readable(path)
     assert_same(got, expected[: len(got)])
-    chunk_ends = [at + length for op, at, length in top_level(whole) if op == 6]
+    chunk_ends = [at + length for op, at, length in top_level(complete) if op == 6]
     full_chunks = sum(end <= cut for end in chunk_ends)
     # 50 blocks a second, and a chunk spans just less than half of one.
     assert len(got) >= min(24 * full_chunks, 120)
@@ -344,10 +344,10 @@ def top_level(content: bytes) -> list[tuple[int, int, int]]:
     return out
 
 
-def test_a_damaged_chunk_costs_itself_only(tmp_path: Path, whole: bytes) -> None:
-    chunks = [(at, length) for op, at, length in top_level(whole) if op == 6]
+def test_a_damaged_chunk_costs_itself_only(tmp_path: Path, complete: bytes) -> None:
+    chunks = [(at, length) for op, at, length in top_level(complete) if op == 6]
     at, length = chunks[1]
-    spoiled = bytearray(whole)
+    spoiled = bytearray(complete)
     spoiled[at + length // 2] ^= 0xFF
     (tmp_path / 'a.mcap').write_bytes(spoiled)
     recording = BagRecording(tmp_path / 'a.mcap')
@@ -359,10 +359,10 @@ def test_a_damaged_chunk_costs_itself_only(tmp_path: Path, whole: bytes) -> None
     assert f'the chunk at byte {at} is damaged' in recording.warnings[0]
 
 
-def test_a_chunk_that_declares_too_much_is_not_unpacked(tmp_path: Path, whole: bytes) -> None:
-    at, _ = next((at, length) for op, at, length in top_level(whole) if op == 6)
+def test_a_chunk_that_declares_too_much_is_not_unpacked(tmp_path: Path, complete: bytes) -> None:
+    at, _ = next((at, length) for op, at, length in top_level(complete) if op == 6)
     for size in (2**62, 2**27):
-        spoiled = bytearray(whole)
+        spoiled = bytearray(complete)
         struct.pack_into('<Q', spoiled, at + 16, size)
         (tmp_path / 'a.mcap').write_bytes(spoiled)
         recording = BagRecording(tmp_path / 'a.mcap')

@@ -260,7 +260,7 @@ def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, rep
 
 
 @pytest.mark.parametrize(
-    ('drift', 'sd', 'noted'),
+    ('drift', 'sd', 'note'),
     [
         ((0.0, 5.1, 0.0, 0.0), 0.06, '+5.1 µm a minute on y1'),
         ((0.0, 4.9, 0.0, 0.0), 0.06, ''),
@@ -273,10 +273,10 @@ def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, rep
         ((0.0, 0.0, 0.0, 26.0), 5.01, ''),
     ],
 )
-def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted(drift: tuple[float, ...], sd: float, noted: str) -> None:
+def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted(drift: tuple[float, ...], sd: float, note: str) -> None:
     minute = 1e-6 / 60.0
     notes = checked(drift=[minute * d for d in drift], drift_sd=minute * sd).notes
-    assert notes == ((f'drift: {noted}; let lasers and amplifier warm up',) if noted else ())
+    assert notes == ((f'drift: {note}; let lasers and amplifier warm up',) if note else ())
 
 
 def test_hum_is_noted_where_it_is_largest() -> None:

@@ -179,9 +179,9 @@ def test_the_times_that_nobody_noted_are_free(began: bool, ended: bool) -> None:
     ws = Workspace([o])
     found = directions(ws, [Plateau(0, 1000, 2500, 1, began, o.loads[1000], ended)])
     assert [d.axis for d in found[:3]] == [0, 1, 2]
-    hung = np.zeros((3, 4000, 3))
-    hung[[0, 1, 2], 1000:2500, [0, 1, 2]] = 1.0
-    assert [np.sign(d.change).tolist() for d in found[:3]] == hung.tolist()
+    applied = np.zeros((3, 4000, 3))
+    applied[[0, 1, 2], 1000:2500, [0, 1, 2]] = 1.0
+    assert [np.sign(d.change).tolist() for d in found[:3]] == applied.tolist()
     wanted = [at for at, there in ((1000, began), (2500, ended)) if there]
     assert [int(np.abs(d.change).sum(axis=1).argmax()) for d in found[3:]] == pytest.approx(wanted, abs=2)
 
