@@ -46,7 +46,7 @@ ADMINISTRATION = re.compile(
 HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says nothing: never run here.
 
 FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b)')
-"""Reads data of others, which are not in the repository: test_duels.py does, if it is there."""
+"""Reads data of others, which are not in the repository."""
 
 NO_CAMPAIGNS = '--no-campaigns'
 
