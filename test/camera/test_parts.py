@@ -175,7 +175,7 @@ LINE = [(80.3, 60.1, 16.0, 20.0), (80.3, 110.1, 16.0, 20.0), (80.3, 160.1, 16.0,
 
 def test_drawn_discs_have_their_places_and_axes() -> None:
     for x in (80.3, 281.3):
-        line = [(x, *rest) for _, *rest in LINE]
+        line = [(x, y, a, b) for _, y, a, b in LINE]
         found = find_discs(discs_at(*line, (150.0, 20.0, 3.0, 3.0)), 2.5)
         assert sorted(r.centre for r in found) == [pytest.approx(disc[:2], abs=0.1) for disc in line]
         assert [r.axes for r in found] == [pytest.approx((16.0, 20.0), abs=0.2)] * 3

@@ -187,7 +187,9 @@ def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
 
 def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
     groups = [MovedGroup('psd_1.gain', 0.01, 3.0, 2, {'psd_1.gain_x': (0.02, 0.001)})]
-    found = checking.CalibrationCheck(False, 0.01, groups, ['psd_2.gain'], 1e-6 * np.arange(4), 1e-7 * np.ones(4))
+    found = checking.CalibrationCheck(
+        False, 0.01, groups, ['psd_2.gain'], np.array([0.0, 1e-6, 2e-6, 3e-6]), np.full(4, 1e-7)
+    )
     tree = checking.result(found)
     assert [*tree['zero']] == [f'psd_{psd}.zero_{axis}' for psd in (1, 2) for axis in 'xy']
     assert [v['value'] for v in tree['zero'].values()] == [0.0, 1e-6, 2e-6, 3e-6]

@@ -97,11 +97,13 @@ def rows_of_two(offset: FloatArray) -> Rows:
     rng, n = np.random.default_rng(8), 120
     pose = rng.uniform(-1.0, 1.0, (n, 3)) * (3e-3, 3e-3, 2e-2)
     run = np.repeat([0, 1], n // 2)
-    dots = misaligned.dots(misaligned.nominal(), pose) + 1e-6 * rng.normal(size=(n, 4)) + run[:, None] * offset
+    dots: FloatArray = (
+        misaligned.dots(misaligned.nominal(), pose) + 1e-6 * rng.normal(size=(n, 4)) + run[:, None] * offset
+    )
     loads, velocity = rng.uniform(-10.0, 10.0, (n, 3)), rng.normal(size=(n, 3)) * 1e-3
     pose += rng.normal(size=(n, 3)) * (2e-5, 2e-5, 2e-4)
     moved, nothing = np.full((n, 4), 1e-12), np.zeros(n, dtype=bool)
-    return Rows(np.arange(n) * 0.1, run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3)))
+    return Rows(np.linspace(0.0, 11.9, n), run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3)))
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
