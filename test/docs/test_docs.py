@@ -219,7 +219,18 @@ def test_the_pages_are_short() -> None:
     assert len((ROOT / 'README.md').read_text().splitlines()) <= 100
     words = {page: len(page.read_text().split()) for page in PAGES}
     assert [page for page, count in words.items() if count > 2500] == []
-    assert sum(words.values()) <= 52_000
+
+
+def test_tables_and_fences_are_complete() -> None:
+    wrong = []
+    for page in PAGES:
+        text = page.read_text()
+        if text.count('\n```') % 2:
+            wrong.append(f'{page.name}: a fence without its end')
+        for table in re.findall(r'(?:^[ ]*\|.*\n)+', re.sub(r'```.*?```', '', text, flags=re.S), re.M):
+            rows = [len(re.findall(r'(?<!\\)\|', re.sub(r'`[^`]*`', '', row))) for row in table.splitlines()]
+            wrong += [f'{page.name}: {row}' for row, n in zip(table.splitlines(), rows, strict=True) if n != rows[0]]
+    assert wrong == []
 
 
 def test_links_lead_somewhere() -> None:
