@@ -99,8 +99,8 @@ def test_the_end_effector_is_composed_of_both(running: Running) -> None:
 
 def test_one_end_effector_is_composed_at_a_time(running: Running, file: ChainFile) -> None:
     running.until(lambda c: c.end is not None)
-    running.chain.close()
     first = running.chain.sessions[0].pipeline.last_estimate
+    running.chain.close()
     assert first is not None
     second = altered(first, t_ns=first.t_ns + 20_000_000)
     chain = ChainSession(file, null_log)
