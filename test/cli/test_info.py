@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -209,6 +210,12 @@ def test_losses_and_missing_estimates_are_marked() -> None:
     assert gone.tolist() == pytest.approx([100 * 0.02, 106 * 0.02], abs=1e-3)
     # Block 50 has too few samples.
     assert t[(dx != dx) & (table['lost'] > 0)].tolist() == pytest.approx([50 * 0.02], abs=1e-3)
+    # Where the time map steps ahead by 15 ms, and back to where stamps are raised, the line is broken as well.
+    for moved_ns in (15_000_000, -19_999_000):
+        later = [s if s.index < 150 else dataclasses.replace(s, t_ns=s.t_ns + moved_ns) for s in drawn.spots]
+        moved = dataclasses.replace(drawn, spots=later).table()
+        breaks = np.setdiff1d(moved['t'][np.isnan(moved['lost'])], gone)
+        assert breaks.tolist() == pytest.approx([150 * 0.02 - 0.01 + moved_ns / 2e9], abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
+from psd_deflection.base.charts import GAP
 from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.text import sanitize
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name, span_options
@@ -159,6 +160,9 @@ class Drawn:
         nothing = (np.nan,) * 6
         rows: list[tuple[float, ...]] = []
         index = self.spots[0].index - 1
+        numbered = np.array([(s.t_ns - start, s.index) for s in self.spots], np.float64)
+        steps, numbers = np.diff(numbered, axis=0).T
+        period = float(np.median(steps / numbers)) / 1e9 if len(steps) else 0.0
         for s in self.spots:
             if s.index != index + 1 and rows:
                 # Blocks that are gone altogether break the line, from the first to the last of them.
@@ -166,6 +170,9 @@ class Drawn:
                 before = rows[-1][0]
                 for k in (1, s.index - index - 1):
                     rows.append((before + k * step, *nothing, *(np.nan,) * (3 * len(s.sums) + 1), 0.0))
+            elif rows and not 0.5 * period < (step := (s.t_ns - start) / 1e9 - rows[-1][0]) < GAP * period:
+                # So does a step of the time map.
+                rows.append((rows[-1][0] + 0.5 * step, *nothing, *(np.nan,) * (3 * len(s.sums) + 1), 0.0))
             index = s.index
             e = self.estimates.get(s.index)
             pose = nothing if e is None else (*e.pose, *(max(v, 0.0) ** 0.5 for v in e.variances))

@@ -75,7 +75,7 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
 def _may_coincide(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
     """Return whether these amplitudes are of different effects and of one unit, and no known cause ties them."""
     effects = [fit.free[column][0] for column, _, _ in group]
-    # What ties two stiffnesses is known, and told by :mod:`.ties`.
+    # What ties two stiffnesses is known, and reported below.
     stiff = [i for i in effects if MOVES_FREQUENCY in fit.effects[i].effect.parameters]
     return len(set(effects)) == len(group) == len([g for g in group if g[2] == group[0][2]]) and len(stiff) < 2
 
