@@ -28,9 +28,9 @@ WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
 BLOCK_NS = 20_000_000
 
 ASK_AGAIN_S = 20.0
+"""An answer that has not come by then is lost."""
 SEND_AGAIN_S = 1.0
 """A message is sent again after it: a node that is late loses some, and one that is flooded rejects them as a flood."""
-"""An answer that has not come by then is lost."""
 
 
 @pytest.fixture(scope='session')
@@ -96,6 +96,7 @@ class Peer:
         self.node = rclpy.create_node('peer', context=self.context)
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
 
     def collect(self, kind: Any, topic: str, qos: Any = 200) -> list[Any]:
         """A list that fills while :meth:`until` spins."""
@@ -142,8 +143,11 @@ class Peer:
         self.until(lambda: bool(messages) and stamp(messages[-1]) > now + BLOCK_NS, what)
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
-        """The answer. DDS loses one that is sent before the server has found this new client: it is asked again."""
-        client = self.node.create_client(kind, name)
+        """The answer. DDS loses one that is sent before the server has found this new client: it is asked again. There
+        is one client for each service: DDS now and then loses one that comes and goes often."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
         self.until(client.service_is_ready, name)
         asked = [(time.monotonic(), client.call_async(request))]
 
@@ -153,7 +157,6 @@ class Peer:
             return any(future.done() for _, future in asked)
 
         self.until(answered, f'the answer of {name}')
-        self.node.destroy_client(client)
         return next(future for _, future in asked if future.done()).result()
 
     def close(self) -> None:
