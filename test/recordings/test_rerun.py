@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -20,6 +21,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.recordings.write.rerun_writer import POSE, RerunFile, Row
+from psd_deflection.records import SpotMeans
 
 BAGS = Path(__file__).parent.parent.parent / 'bags'
 FIND = 'psd_deflection.recordings.write.rerun_writer.importlib.util.find_spec'
@@ -40,13 +42,15 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     return rerun
 
 
-def rows_of(name: str, out: Path) -> dict[str, list[tuple[int, Row]]]:
+def rows_of(name: str, out: Path, moved_ns: int = 0) -> dict[str, list[tuple[int, Row]]]:
+    """``moved_ns``: a step of the time map before block 20."""
     recording = psd_deflection.open(BAGS / name)
     rig = rig_at_start(recording)
     sink = RerunFile(out, rig)
     for records in replayed(recording, Pipeline(rig)):
         for record in records:
-            sink.put(record)
+            later = isinstance(record, SpotMeans) and record.index >= 20
+            sink.put(replace(record, t_ns=record.t_ns + moved_ns) if later else record)
     return sink._rows
 
 
@@ -115,6 +119,16 @@ def test_a_loss_breaks_every_line(tmp_path: Path) -> None:
     lost = {round((t - start) / 2e7): row for t, row in rows['lost']}
     assert (lost[100], lost[106]) == ((20,), (20,))
     assert 101 not in lost
+
+
+@pytest.mark.usefixtures('stand_in')
+@pytest.mark.parametrize('moved_ns', [15_000_000, -19_999_000])
+def test_a_step_of_the_time_map_breaks_every_line(moved_ns: int, tmp_path: Path) -> None:
+    rows = rows_of('clean', tmp_path / 'a.rrd', moved_ns)
+    for path in ('tip/dx', 'psd_2/plane/dot', 'rig/link', 'sums/psd_1'):
+        breaks = [t - rows['lost'][0][0] for t, row in rows[path] if row is None]
+        assert breaks == pytest.approx([19.5 * 2e7 + moved_ns / 2], abs=1e4), path
+    assert None not in [row for _, row in rows['lost']]
 
 
 def test_times_of_a_csv_are_since_its_start(stand_in: MagicMock, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
+from psd_deflection.base.charts import GAP
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import creating
 from psd_deflection.model.plate.layout import bend, tip_boxes
@@ -62,6 +63,7 @@ class RerunFile:
             self.path.open('xb').close()
         self._rr = rr
         self._rig = rig
+        self._block_ns = 1e9 * rig.estimator.block_size / rig.converter.sample_rate_hz
         self._magnify = rig.monitor.markers_magnify
         self._estimate: DeflectionEstimate | None = None
         self._load: TipLoad | None = None
@@ -99,17 +101,22 @@ class RerunFile:
             raise RecordingError(f'{self.path}: cannot be written ({error})') from None
 
     def _gone(self, s: SpotMeans) -> None:
-        """Break every line where whole blocks are missing, and count their samples as lost."""
+        """Break every line where blocks are missing, whose samples count as lost, and at a step of the time map."""
         before = self._before
-        if before is None or s.index == before.index + 1:
+        if before is None:
             return
-        step = (s.t_ns - before.t_ns) / (s.index - before.index)
-        first, last = before.t_ns + round(step), s.t_ns - round(step)
+        step, blocks = s.t_ns - before.t_ns, s.index - before.index
+        if blocks > 1:
+            ends = (before.t_ns + round(step / blocks), s.t_ns - round(step / blocks))
+            for t_ns in dict.fromkeys(ends):
+                self._add('lost', t_ns, (s.present + s.lost,))
+        elif 0.5 < step / self._block_ns < GAP:
+            return
+        else:
+            ends = (before.t_ns + step // 2,)
         for path in self._open:
             if path != 'lost':
-                self._add(path, first, None)
-        for t_ns in dict.fromkeys((first, last)):
-            self._add('lost', t_ns, (s.present + s.lost,))
+                self._add(path, ends[0], None)
 
     def _block(self, s: SpotMeans) -> None:
         t_ns, e, load = s.t_ns, self._estimate, self._load
