@@ -244,6 +244,18 @@ def test_frozen_psd_is_not_the_psd_that_contradicts(three: Rig) -> None:
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
 
+@pytest.mark.parametrize('still', [0, 1])
+def test_of_two_outlier_candidates_the_frozen_one_is_excluded(three: Rig, still: int) -> None:
+    """PSD 1 or PSD 2 is off across its base line to PSD 3, so that either may be wrong."""
+    rig = with_solver(three, 'exact', **LEVEL)
+    dots, along = np.zeros(6), rig.centers[still] - rig.centers[2]
+    dots[2 * still : 2 * still + 2] = 1e-4 * np.array([-along[1], along[0]]) / np.hypot(*along)
+    counts = at_rest(rig, dots, 200, 1)
+    counts[:, 3 * still : 3 * still + 3] = counts[0, 3 * still : 3 * still + 3]
+    excluded = [s.excluded for s in spots_of(list(Pipeline(rig).process(chunk_of(counts))))]
+    assert excluded == [()] * 4 + [(still + 1,)] * 6
+
+
 @pytest.mark.slow
 def test_reject_rejects_only_what_cannot_be_reported(three: Rig) -> None:
     report, _, _ = run(with_solver(three, 'exact', consistency='reject', **LEVEL), inverted(2))
