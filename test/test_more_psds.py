@@ -252,8 +252,10 @@ def test_of_two_outlier_candidates_the_frozen_one_is_excluded(three: Rig, still:
     dots[2 * still : 2 * still + 2] = 1e-4 * np.array([-along[1], along[0]]) / np.hypot(*along)
     counts = at_rest(rig, dots, 200, 1)
     counts[:, 3 * still : 3 * still + 3] = counts[0, 3 * still : 3 * still + 3]
-    excluded = [s.excluded for s in spots_of(list(Pipeline(rig).process(chunk_of(counts))))]
+    pipeline = Pipeline(rig)
+    excluded = [s.excluded for s in spots_of(list(pipeline.process(chunk_of(counts))))]
     assert excluded == [()] * 4 + [(still + 1,)] * 6
+    assert pipeline.counters.findings[f'psd_{still + 1} contradicts the others and is left out'] == 6
 
 
 @pytest.mark.slow

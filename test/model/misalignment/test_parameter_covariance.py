@@ -109,7 +109,6 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     assert next(other.process(chunk_of(dots[600:], 600))) == records[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('blocks', [1, 2, 25])
 def test_zero_variance_is_block_variance_over_count(blocks: int) -> None:
     """What scatters by more than the noise says is believed; of one block there is only what the noise says."""
