@@ -244,10 +244,11 @@ def test_frozen_psd_is_not_the_psd_that_contradicts(three: Rig) -> None:
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
 
-@pytest.mark.parametrize('still', [0, 1])
-def test_of_two_outlier_candidates_the_frozen_one_is_excluded(three: Rig, still: int) -> None:
-    """PSD 1 or PSD 2 is off across its base line to PSD 3, so that either may be wrong."""
-    rig = with_solver(three, 'exact', **LEVEL)
+@pytest.mark.parametrize(('still', 'place'), [(0, [-0.1, 0.0]), (1, [-0.1, 0.0]), (1, [0.0, 0.07])])
+def test_of_two_outlier_candidates_the_frozen_one_is_excluded(three: Rig, still: int, place: list[float]) -> None:
+    """PSD 1 or PSD 2 is off across its base line to PSD 3, so that either may be wrong: PSD 3 is not, even if the
+    first two are in one place and say nothing without it."""
+    rig = with_solver(three, 'exact', **LEVEL, **{'psd_2.center': place})
     dots, along = np.zeros(6), rig.centers[still] - rig.centers[2]
     dots[2 * still : 2 * still + 2] = 1e-4 * np.array([-along[1], along[0]]) / np.hypot(*along)
     counts = at_rest(rig, dots, 200, 1)
