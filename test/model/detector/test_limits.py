@@ -185,6 +185,12 @@ def test_a_detector_is_still_if_x_y_and_sum_are(channel: int) -> None:
         assert health.still(of(moved)) == ((False, True) if channel < 3 else (True, False))
 
 
+@pytest.mark.parametrize(('noise', 'still'), [(STEP, False), (1.01 * STEP, True)])
+def test_a_detector_of_noise_below_a_step_may_be_constant(noise: float, still: bool) -> None:
+    volts = np.tile(np.array(GOOD, np.float32), (10, 1))
+    assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(of(volts)) == (still, still)
+
+
 @pytest.mark.parametrize('channel', range(6))
 @pytest.mark.parametrize('size', [10, 20])
 def test_noise_is_separated_at_five_times_rig_noise(channel: int, size: int) -> None:

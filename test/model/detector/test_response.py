@@ -107,7 +107,7 @@ def test_calibration_response_inverts_simulation(
     assert response.slopes(np.array(x), np.array(y))[:, 0] == pytest.approx(slope, abs=1e-3)
 
 
-@pytest.mark.parametrize('k', [-3000.0, -9000.0])
+@pytest.mark.parametrize('k', [-0.5, -3000.0, -9000.0])
 def test_beyond_the_fold_the_inverse_is_a_straight_line(k: float) -> None:
     """r (1 + k r^2) has a slope of a tenth at sqrt(0.3/-k), where it reads 0.7 r; farther out it would fold back."""
     farthest = (0.3 / -k) ** 0.5
