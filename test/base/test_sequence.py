@@ -63,6 +63,7 @@ HALF = WRAP // 2
         (-63, 0, Step.REPEAT),
         (-63, 1, Step.RESTART),
         (-64, 0, Step.RESTART),
+        (0, 1, Step.REPEAT),
         # A gap of less than half way round, if the time is newer.
         (64, 1, Step.GAP),
         (64, 0, Step.RESTART),

@@ -500,7 +500,8 @@ def test_a_message_that_is_cut_is_rejected(name: str, data: st.DataObject) -> No
 
 
 def test_an_independent_decoder_reads_the_rig() -> None:
-    state = RigState(5, 7, {'psd_1.zero': [0.1, 0.2], 'psd_2.zero': [0.0, 0.0]}, {'serial': 'ö'}, {'sum_min': 2.0}, '1')
+    zeros = {'psd_1.zero': [0.1, 0.2], 'psd_2.zero': [0.0, 0.0]}
+    state = RigState(5, 7, zeros, {'serial': 'ö'}, {'sum_min': 2.0}, '1', {'numpy': '2'})
     (m,) = to_messages(state)
     raw = cdr.encode(m.type, m.fields)
     text = STORE.deserialize_cdr(raw, m.type).data
