@@ -127,6 +127,10 @@ def test_a_dead_reading_is_no_better_than_a_converters_step() -> None:
     dots[:, 3] = 0.0
     feed(noise, dots)
     assert noise.mean_sd()[3] >= 1e-6 / 12.0**0.5
+    # If all are dead, nothing moves.
+    noise = stream(step=1e-6)
+    feed(noise, np.zeros((SEGMENT, 4)))
+    assert rested(noise)
 
 
 def test_another_one_goes_on_from_the_state_to_the_bit() -> None:
@@ -247,7 +251,7 @@ def fed(samples: npt.NDArray[np.float32], file: float = FILE) -> ConverterSteps:
     return steps
 
 
-@pytest.mark.parametrize('bits', [8, 10, 12, 14])
+@pytest.mark.parametrize('bits', [8, 10, 12, 14, 15])
 @pytest.mark.parametrize('offset', [0.0, 0.5])
 @pytest.mark.parametrize('noise', [2e-3, 0.2])
 def test_coarse_steps_are_found_on_every_channel(bits: int, offset: float, noise: float) -> None:

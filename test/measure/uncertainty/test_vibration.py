@@ -59,6 +59,17 @@ def test_two_tones_are_two_and_what_does_not_take_part_stays_out() -> None:
     assert words_of((Tone(0.087, np.eye(4) * 200e-12),), RATE) == '14 µm rms near 87 Hz'
 
 
+def test_the_floor_of_a_tone_is_that_about_it() -> None:
+    """Noise whose power falls to 1e-4 at 222 Hz: in its quiet half a tone of 2 um stands out, in its loud half not."""
+    spectrum = (
+        np.random.default_rng(4).normal(size=(2, N // 2 + 1, 2))
+        * np.where(np.arange(N // 2 + 1) < 222, 1.0, 0.01)[:, None]
+    )
+    moving = 1e-3 * np.fft.irfft(spectrum[0] + 1j * spectrum[1], axis=0)
+    for hz, names in ((247.0, [247]), (197.0, [])):
+        assert [round(t.frequency * RATE) for t in found(moving + 2e-6 * tone(hz)[:, None], noise(2))] == names
+
+
 @pytest.mark.parametrize('share', [0.15, 1.0])
 def test_hum_in_what_cannot_move_is_no_motion(share: float) -> None:
     moving = noise(1) + 5e-6 * tone(50.0)[:, None]
