@@ -92,6 +92,8 @@ def test_derivatives_agree_with_differences() -> None:
 def test_a_flat_pose_comes_back(rays: Any) -> None:
     flat = POSES * [1.0, 1.0, 20.0, 0.0, 0.0]
     level = Geometry(STAGGERED.centers, STAGGERED.zeros, np.zeros(3), 0.585)
+    # Unless it is given that of a beam with a force at its end: L^2/2 over L^3/3.
+    assert level.slope_ratio == (1 / 2) / (1 / 3)
     points = np.array([rays.tip_dots(level, pose) for pose in flat]).reshape(6, 3, 2) + level.centers
     assert flat_points(flat[:, :3], level.beams) == pytest.approx(points, abs=1e-15)
     assert flat_poses(points, level.beams) == pytest.approx(flat[:, :3], abs=1e-14)
