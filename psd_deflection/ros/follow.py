@@ -18,6 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 from psd_deflection.arms.compensation.trajectory import JointsError, MovingError, OldStampError, TrajectoryShaper
 from psd_deflection.arms.inputs import LONGEST_LIST, stamp_fault
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import WARNING
 from psd_deflection.ros.declared import SOURCE
 from psd_deflection.ros.endpoints import OF_RCLPY
 from psd_deflection.ros.node import BaseNode
@@ -69,13 +70,21 @@ class Follower:
     """Serves the action, and is a client of ``action``, the controller's.
 
     ``shape``: makes a trajectory what the controller gets, or raises ConfigError; it works on
-    ``shaper``. Raises ConfigError if ``action`` is no name, or control_msgs is not installed.
+    ``shaper``. ``joints_fault``: why the joints are not where they should be, or ''. Raises ConfigError if ``action``
+    is no name, or control_msgs is not installed.
 
     ``taken``: goals that the controller has taken. ``under_way``: how many have not ended.
     """
 
-    def __init__(self, owner: BaseNode[Any], action: str, shape: Shape, shaper: TrajectoryShaper) -> None:
-        self._owner, self._shape, self._shaper = owner, shape, shaper
+    def __init__(
+        self,
+        owner: BaseNode[Any],
+        action: str,
+        shape: Shape,
+        shaper: TrajectoryShaper,
+        joints_fault: Callable[[], str],
+    ) -> None:
+        self._owner, self._shape, self._shaper, self._joints_fault = owner, shape, shaper, joints_fault
         self.taken = 0
         self._goals: list[_Goal] = []
         self._waiting: deque[_Goal] = deque(maxlen=MOST_WAITING)
@@ -248,7 +257,10 @@ class Follower:
             goal.handle.publish_feedback(message.feedback)
 
     def _resulted(self, goal: _Goal, response: Any) -> None:
-        if response.status != GoalStatus.STATUS_SUCCEEDED and goal is self._newest:
+        if response.status == GoalStatus.STATUS_SUCCEEDED:
+            if goal is self._newest and (why := self._joints_fault()):
+                self._owner.log(f'{self.action} says that it has reached the goal, but {why}', WARNING)
+        elif goal is self._newest:
             # It holds the joints, unless the goal that it is asked for has taken the place of this one.
             self._held = self._asked is not None
             if not self._held:

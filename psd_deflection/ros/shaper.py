@@ -59,7 +59,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         self.gate.listen(TRAJECTORY, _trajectory_fault, self._given)
         self.gate.listen(JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
         if self.settings.action:
-            self._follow = Follower(self, self.settings.action, self._shape, self._shaper)
+            self._follow = Follower(self, self.settings.action, self._shape, self._shaper, self._joints_fault)
         self._undescribed = self.settings.urdf == DESCRIPTION
         if self._undescribed:
             listen_to_description(self.gate, self._described_as)
@@ -75,6 +75,9 @@ class ShaperNode(BaseNode[ShaperSettings]):
 
     def _joints(self, message: Any) -> None:
         self._known.notify(time.monotonic(), message.name, message.position)
+
+    def _joints_fault(self) -> str:
+        return self._shaper.joints_fault(self.now_ns(), self._known.measured(time.monotonic()))
 
     def _given(self, message: Any) -> None:
         if not self.active:
@@ -106,6 +109,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
         trajectory = _trajectory(message)
         stamp_ns = int(Time.from_msg(message.header.stamp).nanoseconds)
         start_ns = start_of(self.now_ns(), stamp_ns, self.settings.lead)
+        if self._shaper.moves(start_ns) and (why := self._joints_fault()):
+            raise ConfigError(why)
         shaped = self._shaper.shape(start_ns, trajectory, self._known.measured(time.monotonic()))
         self._shaped += 1
         # Whoever gets it begins when we did, however long the message takes: one that replaces

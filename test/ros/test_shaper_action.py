@@ -45,6 +45,7 @@ class Arm:
 
         self.peer, self.action = peer, FollowJointTrajectory
         self.controller: ServedController | None = self.serving()
+        self.stuck = False
         self._out = peer.node.create_publisher(JointState, '/joint_states', 5)
         peer.node.create_timer(0.005, self._step)
         self.client = ActionClient(peer.node, FollowJointTrajectory, FOLLOW)
@@ -61,7 +62,8 @@ class Arm:
         at = START
         if self.controller is not None:
             self.controller.step(now)
-            at = self.controller.controller.state(now)[0]
+            if not self.stuck:
+                at = self.controller.controller.state(now)[0]
         self._out.publish(JointState(name=list(NAMES), position=at.tolist()))
 
     def ready(self) -> None:
@@ -95,10 +97,14 @@ class Arm:
         response = self.result(handle)
         return response.status, response.result
 
-    def moves(self) -> bool:
+    def away(self) -> float:
+        """How far the controller is from where it began, rad."""
         assert self.controller is not None
         at = self.controller.controller.state(self.peer.node.get_clock().now().nanoseconds / 1e9)[0]
-        return bool(np.abs(at - START).max() > 0.02)
+        return float(np.abs(at - START).max())
+
+    def moves(self) -> bool:
+        return self.away() > 0.02
 
 
 @pytest.fixture(scope='session')
@@ -185,6 +191,20 @@ def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Callable[...,
     assert status == SUCCEEDED
     _, path = arriving(arm.controller.goals[-1].trajectory, NAMES)
     np.testing.assert_allclose(path.states[0], [held, [0.0, 0.0]], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_joints_that_stand_are_believed_and_no_feedback(begin: Callable[..., Arm]) -> None:
+    arm = begin()
+    arm.stuck = True
+    first = arm.send(arm.goal(seconds=6.0))
+    arm.peer.until(lambda: arm.away() > 0.2, 'motion')
+    status, result = arm.followed(arm.goal())
+    assert (status, result.error_code) == (ABORTED, -1)
+    assert 'rad or m from where the last trajectory has it' in result.error_string
+    assert arm.result(first).status == SUCCEEDED
+    reached = 'says that it has reached the goal, but shoulder is 0.2 rad or m from where'
+    arm.peer.until(lambda: reached in arm.shaper.text, 'the warning')
 
 
 @pytest.mark.slow

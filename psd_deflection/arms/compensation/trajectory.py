@@ -35,6 +35,8 @@ STANDS = 0.05
 default, it goes a tenth of what ``max_step`` allows."""
 PARTS = 8
 """Parts of each piece of a trajectory whose ends are held against the limits."""
+LATE_S = 0.3
+"""Joints may be where they were commanded to be so long ago, s: a servo lags, and so do messages."""
 OLDEST_S = 1.0
 """A trajectory whose start is longer ago than this is rejected."""
 QUANTITIES = ('positions', 'velocities', 'accelerations')
@@ -194,6 +196,23 @@ class TrajectoryShaper:
             return False
         start_ns, path = self.history[-1]
         return (t_ns - start_ns) / 1e9 < path.duration + self.shaper.duration
+
+    def joints_fault(self, now_ns: int, measured: Mapping[str, MeasuredJoint]) -> str:
+        """Why the joints are not where the last trajectory has them; '' if each of them is within ``max_step`` of where
+        it was commanded to be at some time of the last ``LATE_S``, or is not measured."""
+        if not self.history:
+            return ''
+        names = self.history[-1].path.names
+        pieces = [_Piece(t, path.ordered(names)) for t, path in self.history]
+        commanded = self._shaped(pieces, now_ns, np.linspace(-LATE_S, 0.0, 31), 1)[:, 0]
+        for name, way in zip(names, commanded.T, strict=True):
+            at = measured[name].position if name in measured else way[-1]
+            if max(way.min() - at, at - way.max()) > self.max_step:
+                away = abs(at - way[-1])
+                return (
+                    f'{name} is {away:.3g} rad or m from where the last trajectory has it: does the controller follow?'
+                )
+        return ''
 
     def shape(self, start_ns: int, given: Trajectory, measured: Mapping[str, MeasuredJoint]) -> Trajectory:
         """``given`` shaped, both from ``start_ns`` on. ``measured``: the joints; one that is to move must be known.

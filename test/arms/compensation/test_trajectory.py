@@ -131,6 +131,25 @@ def test_points_of_twice_replaced_trajectory_are_kept() -> None:
     assert np.abs(shaped.times - kink).min() < 1e-6
 
 
+def test_joints_that_do_not_follow_are_named() -> None:
+    by = TrajectoryShaper(ZVD, max_step=0.05)
+    assert by.joints_fault(0, ZERO) == ''
+    path = by.shape(S, moved(1), ZERO)
+    way = path.at(np.arange(0.0, path.duration, 0.01))[:, 0]
+    for i, here in enumerate(way):
+        now = S + i * S // 100
+        # 0.3 s late is not too late, nor is 0.049 beside the path.
+        late = way[max(i - 29, 0)]
+        for at in (here, late, here + 0.049, late - 0.049):
+            assert by.joints_fault(now, standing(dict(zip(NAMES, at.tolist(), strict=True)))) == '', i
+    end = S + round(S * path.duration)
+    stuck = by.joints_fault(end, ZERO)
+    assert f'{NAMES[0]} is {path.states[-1, 0, 0]:.3g} rad or m from where' in stuck
+    assert by.joints_fault(end, standing({NAMES[1]: float(path.states[-1, 0, 1])})) == ''
+    by.forget()
+    assert by.joints_fault(end, ZERO) == ''
+
+
 def test_a_stream_of_set_points_is_shaped() -> None:
     by = TrajectoryShaper(ZV, max_step=0.05)
     period, heard = 0.02, []
