@@ -171,27 +171,34 @@ def test_clock_off_by_two_milliseconds_is_fitted_early(ppm: float, seconds: int,
 
 
 @pytest.mark.parametrize(
-    ('drift_ns', 'above_ns', 'fitted'), [(1_999_999, 0, False), (2_000_000, 0, True), (9_000_000, 1_000_000, False)]
+    ('drift_ns', 'above_ns', 'fitted'),
+    # 7.8125 ms in 2 s are 1/256, which no rounding moves.
+    [(1_999_999, 0, False), (2_000_000, 0, True), (7_812_500, 999_999, True), (7_812_500, 1_000_000, False)],
 )
 def test_two_milliseconds_in_three_seconds_are_a_rate(drift_ns: int, above_ns: int, fitted: bool) -> None:
-    """Three least delays, half a second after each first sample, which is 3 ms late; the middle one is off the line."""
+    """Three least delays, half a second after each first sample, which is 9 ms late; the middle one is off the line."""
     clock = ClockMap()
     for half in range(7):
-        late = 3 * MS if half % 2 == 0 else (drift_ns * (half // 2) + 1) // 2 + (above_ns if half == 3 else 0)
+        late = 9 * MS if half % 2 == 0 else (drift_ns * (half // 2) + 1) // 2 + (above_ns if half == 3 else 0)
         clock.observe(500_000 * half, 500 * MS * half + late)
     assert clock.state().points == 3
     assert (clock.state().skew_ppm != 0.0) == fitted
 
 
-@pytest.mark.parametrize(('late_share', 'step'), [(0.099, 21 * MS), (0.101, 0), (-0.099, 21 * MS), (-0.101, 0)])
-def test_a_line_that_drains_steps_by_two_milliseconds(late_share: float, step: int) -> None:
-    """After a step samples come 21 ms early again, faster than their clock goes by."""
+@pytest.mark.parametrize(
+    ('early_ns', 'late_share', 'step'),
+    [(21 * MS, share, 21 * MS if abs(share) < 0.1 else 0) for share in (0.099, 0.101, -0.099, -0.101)]
+    + [(2 * MS, 0.0, 0), (2 * MS + 1, 0.0, 2 * MS + 1)],
+)
+def test_a_line_that_drains_steps_by_two_milliseconds(early_ns: int, late_share: float, step: int) -> None:
+    """After a step samples come early again, faster than their clock goes by: 3 ms of it in 1 ms, or 21 ms in none."""
     clock = ClockMap()
     clock.observe(0, 1000 * MS)
     assert not clock.observe(100_000, 1000 * MS, passed_us=100_000.0)
     assert clock.drains
     assert clock.stepped_ns == -100 * MS
-    clock.observe(121_000, 1000 * MS, passed_us=21_000.0 * (1.0 + late_share))
+    passed_us = 21_000 if early_ns == 21 * MS else 3000
+    clock.observe(100_000 + passed_us, 1000 * MS + 1000 * passed_us - early_ns, passed_us * (1.0 + late_share))
     assert clock.stepped_ns == -100 * MS - step
 
 
@@ -270,7 +277,11 @@ def test_an_answer_fifty_milliseconds_off_is_believed(off_ns: int, believed: boo
         assert clock.state().round_trip_ns == (101 * MS + sign * off_ns if believed else None)
 
 
-def test_the_map_turns_at_the_last_stamp() -> None:
+@pytest.mark.parametrize(
+    ('by_us', 'before_us', 'last_us'), [(0, 0, 20_000), (5000, 20_000, 25_000), (5000, 9000, 20_000)]
+)
+def test_the_map_turns_at_the_last_stamp(by_us: int, before_us: int, last_us: int) -> None:
+    """Also if the clock was found to have jumped, after that stamp or before it."""
     clock = ClockMap()
     clock.observe(0, MS)
     clock.observe(1000, MS)
@@ -278,8 +289,11 @@ def test_the_map_turns_at_the_last_stamp() -> None:
     stamps = clock.to_host_ns(np.arange(1000, 21_000, 1000, dtype=np.int64))
     assert stamps.tolist() == [MS + k * (MS - 1000) for k in range(1, 21)]
     # And by 2 us from here on.
-    clock.observe(20_500, 20_500_000 - 9 * MS)
-    assert [clock.host_ns(20_000 + us) for us in (0, 1000)] == [stamps[-1], stamps[-1] + MS - 2000]
+    clock.shift(by_us, before_us)
+    own_us = last_us - by_us
+    clock.observe(last_us + 500, 1000 * (own_us + 500) - 9 * MS)
+    last = int(stamps[own_us // 1000 - 1])
+    assert [clock.host_ns(last_us + us) for us in (0, 1000)] == [last, last + MS - 2000]
 
 
 def test_lower_line_is_closest_of_lines_below_points() -> None:
@@ -298,6 +312,14 @@ def test_lower_line_is_closest_of_lines_below_points() -> None:
         assert sum(over) == pytest.approx(min(far), abs=1e-9)
     # Of one abscissa there is no slope.
     assert lower_line([(5, 7), (5, 3)]) == lower_line([(5, 3)]) == (0.0, 3.0)
+
+
+@pytest.mark.parametrize(('late_ns', 'jumped'), [(5000 * MS, False), (5000 * MS + 1, True)])
+def test_a_second_that_is_five_seconds_late_is_a_jump(late_ns: int, jumped: bool) -> None:
+    clock = ClockMap()
+    for second in range(13):
+        t_ns = 1000 * MS * second + (late_ns if second > 10 else 0)
+        assert clock.observe(1_000_000 * second, t_ns, passed_us=1e6) == (jumped and second == 12)
 
 
 @pytest.mark.parametrize(('early_ns', 'jumped'), [(50_000_000, False), (50_000_001, True)])
