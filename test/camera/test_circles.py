@@ -185,6 +185,19 @@ def test_what_cannot_be_measured_is_rejected_with_the_reason(status: Status, sce
     assert (answer.status, answer.covariance) == (status, None)
 
 
+@pytest.mark.parametrize(
+    ('moved', 'right', 'wrong'), [(0.0, 0.03, 0.05), (0.4e-3, 0.06, 0.075)], ids=['still', 'moved']
+)
+def test_light_in_waves_fits_no_target(moved: float, right: float, wrong: float) -> None:
+    """By a share of the light that is larger for a motion, whose profile is not known."""
+    scene = Scene()
+    image = photograph(scene, [Pose(dx=moved * i / 12) for i in range(12)], np.random.default_rng(1))
+    for share, status in ((right, Status.OK), (wrong, Status.MISFIT)):
+        waves = np.rint(np.clip(image * (1.0 + share * np.cos(np.arange(scene.width) / 3.0)), 0, 255))
+        reference = CameraReference(replace(settings_of(scene), rest_frames=1), target_of)
+        assert [a.status for a in reference.take(0, waves.astype(np.uint8))] == [status]
+
+
 def test_an_overexposed_target_is_rejected() -> None:
     scene, rng = Scene(black=60.0, white=900.0), np.random.default_rng(1)
     reference = CameraReference(settings_of(scene), target_of)

@@ -15,11 +15,13 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera import discs
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs import find_discs
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
+from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import declared_size
 from psd_deflection.camera.reference import CameraReference, mean_pose, relative, relative_covariance
 from psd_deflection.camera.refine_corners import refined
@@ -142,11 +144,15 @@ def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
     assert place == pytest.approx(at, abs=1e-9)
 
 
-@pytest.mark.parametrize('crossing', [True, False])
-def test_corners_of_the_model_are_found_exactly(crossing: bool) -> None:
-    """Two corners of edges at 75 degrees, one brighter on its inside, one darker on a board; one is at the border."""
+@pytest.mark.parametrize(
+    ('crossing', 'sharp', 'off', 'there'),
+    [(True, 1.0, 1.45, True), (False, 1.0, 0.3, True), (True, 1.0, 1.55, False), (False, 0.2, 0.3, False)],
+)
+def test_corners_of_the_model_are_found_exactly(crossing: bool, sharp: float, off: float, there: bool) -> None:
+    """Two corners of edges at 75 degrees, one brighter on its inside, one darker on a board; one is at the border.
+    None are found from more than a pixel and a half away, nor before the blur of a tag's corner has settled."""
     v, u = np.mgrid[:40, :70].astype(float)
-    true, blur = np.array([[20.3, 17.6], [50.1, 21.8], [3.0, 20.0]]), np.array([0.9, 1.3])
+    true, blur = np.array([[20.3, 17.6], [50.1, 21.8], [3.0, 20.0]]), np.array([0.9, 1.3]) / sharp
     first, second = np.array([math.cos(0.2), math.sin(0.2)]), np.array([math.cos(1.5), math.sin(1.5)])
     # Across each edge, to the side of the other.
     n1 = np.array([second[1], -second[0]])
@@ -156,11 +162,13 @@ def test_corners_of_the_model_are_found_exactly(crossing: bool) -> None:
         a, b = (((u - x) * n[0] + (v - y) * n[1]) / s for n, s in zip((n1, n2), blur, strict=True))
         light = (2.0 * ndtr(a) - 1.0) * (2.0 * ndtr(b) - 1.0) if crossing else ndtr(a) * ndtr(b)
         image = np.where(np.abs(u - x) < 15.0, 120.0 + contrast * light, image)
-    found = refined(image, np.round(true) + 0.2, np.tile([first, second], (3, 1, 1)), 6.5, crossing)
+    found = refined(image, true + np.array([off, 0.0]), np.tile([first, second], (3, 1, 1)), 6.5, crossing)
+    assert np.isfinite(found.pixels).all(axis=1).tolist() == [there, there, False]
+    if not there:
+        return
     assert found.pixels[:2] == pytest.approx(true[:2], abs=1e-4)
     assert found.blur[:2] == pytest.approx(np.tile(blur, (2, 1)), abs=1e-3)
     assert found.misfit[:2] == pytest.approx(0.0, abs=1e-4)
-    assert np.isnan(found.pixels[2]).all()
 
 
 def discs_at(*places: tuple[float, float, float, float]) -> Any:
@@ -180,6 +188,24 @@ def test_drawn_discs_have_their_places_and_axes() -> None:
         assert sorted(r.centre for r in found) == [pytest.approx(disc[:2], abs=0.1) for disc in line]
         assert [r.axes for r in found] == [pytest.approx((16.0, 20.0), abs=0.2)] * 3
         assert [r.shape for r in found] == [pytest.approx((256.0, 0.0, 400.0), abs=9.0)] * 3
+
+
+@pytest.mark.parametrize(('apart', 'alike'), [(29.0, 1.0), (31.0, 0.0)])
+def test_covariance_has_a_second_tilt_that_is_as_likely(
+    apart: float, alike: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the antisymmetric part of a turn is its sine about its axis; by 30 the log likelihoods are told apart."""
+    best = altered(target(np.array([0.2, -0.1, 0.0]), np.array([0.01, 0.02, 0.5]), np.zeros(0), 1), residuals=100)
+    best = altered(best, points=np.array([[80.3, 60.1], [80.3, 110.1], [80.3, 160.1]]))
+    turn, shift = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 2e-3, -1e-3])
+    other = altered(shifted(best, np.concatenate([turn, shift])), cost=apart / 100.0)
+    fits = iter([other, best])
+    monkeypatch.setattr(discs, 'Fitter', lambda *_: SimpleNamespace(fit=lambda *_: next(fits)))
+    lens = Lens(np.array([[1000.0, 0.0, 150.0], [0.0, 1000.0, 100.0], [0.0, 0.0, 1.0]]), np.zeros(0))
+    image = discs_at(*LINE)
+    found = target_of(CameraSettings(spacing=0.025, radius=0.01)).locate(image, image, lens, 255.0)
+    off = np.concatenate([np.sinc(np.linalg.norm(turn) / math.pi) * turn, shift])
+    np.testing.assert_allclose(found.covariance, best.covariance + alike * np.outer(off, off), rtol=1e-9)
 
 
 @pytest.mark.parametrize(

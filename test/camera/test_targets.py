@@ -141,6 +141,16 @@ def test_board_noise_is_pose_residual_over_freedom() -> None:
     assert found.noise**2 == pytest.approx(left / (32 - 6), rel=0.005)
 
 
+@pytest.mark.parametrize(('settings', 'free'), [(replace(BOARD, marker=0.008), 1e-3), (TAGS, 1.4e-3)])
+def test_board_is_too_small_with_less_than_2_5_px_around_corners(settings: CameraSettings, free: float) -> None:
+    for share, status in ((0.98, Status.OK), (1.02, Status.SMALL)):
+        scene = replace(SMALL, distance=share * free * SMALL.focal / 2.5)
+        image = shot(scene, settings, Pose(), np.random.default_rng(3))
+        assert [a.status for a in CameraReference(replace(settings, rest_frames=1), target_of).take(0, image)] == [
+            status
+        ]
+
+
 def test_half_a_board_and_none_are_rejected() -> None:
     rng = np.random.default_rng(3)
     image = shot(SMALL, BOARD, Pose(), rng)

@@ -156,7 +156,7 @@ def known_of_rig(rig: Rig) -> Known:
     names, sds, given = rig.calibration.names, np.array(rig.calibration.sds), np.array(rig.calibration.correlations)
     n = len(names)
     correlation = np.eye(n)
-    if n > 1 and given.any():
+    if given.any():
         if len(given) != n * (n - 1) // 2:
             raise ConfigError(
                 f'calibration.correlations: {len(given)} values for {n} names; must be {n * (n - 1) // 2}'

@@ -65,3 +65,5 @@ def test_a_tube_is_found_for_a_stiffness() -> None:
     assert tube.wall == pytest.approx(SECTION.wall, rel=1e-12)
     # The thesis's "equivalent virtual diameter", which it gives as 29.76 mm.
     assert tube.mean_radius == pytest.approx(29.737e-3, abs=5e-7)
+    rod = TubeSection.of_stiffness(np.pi / 4.0 * 0.01**4, 0.01)
+    assert (rod.outer_radius, rod.inner_radius) == pytest.approx((0.01, 0.0), abs=1e-16)

@@ -100,6 +100,10 @@ def test_a_rig_file_of_a_vector_corrects_the_dots(truth: dict[str, float], poses
         ({'calibration.names': ['psd_1.height', 'psd_1.height']}, 'a name is there twice'),
         ({'calibration.names': ['psd_1.height'], 'calibration.sds': [1e-3, 1e-3]}, '2 values for 1 calibration.names'),
         (
+            {'calibration.names': ['psd_1.height'], 'calibration.sds': [1e-3], 'calibration.correlations': [0.5]},
+            '1 values for 1 names; must be 0',
+        ),
+        (
             {
                 'calibration.names': ['psd_1.height', 'psd_2.height', 'psd_1.rotation'],
                 'calibration.sds': [1e-3, 1e-3, 1e-3],

@@ -68,7 +68,6 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
         assert message / np.outer(sd, sd) == pytest.approx(observed / np.outer(sd, sd), abs=0.25), name
 
 
-@pytest.mark.slow
 def test_the_polynomial_is_what_it_stands_for() -> None:
     from psd_deflection.model.misalignment.rig import dots_by_parameters
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -27,7 +27,6 @@ COUNT = 9
 RIG = load_rig()
 EFFECTS = catalogue()
 Values = Mapping[str, float]
-Rows = dict[str, FloatArray]
 
 
 def physics() -> Physics:
@@ -69,32 +68,6 @@ def applied(name: str, given: Values, samples: SimulatedSamples) -> SimulatedSam
     assert apply is not None
     apply(out, values_of(name, given), {})
     return out
-
-
-def of_psd(
-    rows: FloatArray, psd: int, change: Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]]
-) -> FloatArray:
-    """``rows`` (2P, n) with the x and y of one PSD changed."""
-    out = rows.copy()
-    at = 2 * (psd - 1)
-    out[at], out[at + 1] = change(rows[at], rows[at + 1])
-    return out
-
-
-def light(s: SimulatedSamples, v: Values) -> Rows:
-    """The centroid of two spots, each with its weight."""
-    psd = int(v['psd'])
-    total = s.sums[psd - 1] + v['level']
-
-    def change(x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
-        return tuple(
-            np.average([d, np.full(COUNT, c)], axis=0, weights=[s.sums[psd - 1], np.full(COUNT, v['level'])])
-            for d, c in ((x, v['x']), (y, v['y']))
-        )
-
-    sums = s.sums.copy()
-    sums[psd - 1] = total
-    return {'dots': of_psd(s.dots, psd, change), 'sums': sums}
 
 
 def test_impossible_reading_is_corrected_to_finite_value() -> None:
