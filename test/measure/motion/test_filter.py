@@ -13,10 +13,10 @@ from scipy.linalg import expm
 
 from blind import motion
 from psd_deflection.measure.motion.inertia import Inertia
-from psd_deflection.measure.motion.modal import BlockTables, Oscillator
+from psd_deflection.measure.motion.modal import BlockTables, KnownLoads, Oscillator
 from psd_deflection.measure.motion.motion import ModalFilter, TipState
-from psd_deflection.measure.motion.unseen import LARGER, UnseenLoads
-from psd_deflection.records import BaseAcceleration, FloatArray
+from psd_deflection.measure.motion.unseen import LARGER, Innovations, UnseenLoads
+from psd_deflection.records import AppliedLoad, BaseAcceleration, FloatArray
 
 N, MS = 20, 1_000_000
 SLOTS = np.arange(N)
@@ -40,9 +40,9 @@ def linear() -> ModalFilter:
     return of(filter_load_walk=[10.0, 10.0, 1.0])
 
 
-def after(blocks: list[FloatArray]) -> TipState:
-    """The motion at the end of ``blocks`` (N, 3) of poses."""
-    one = linear()
+def after(one: ModalFilter, blocks: list[FloatArray]) -> TipState:
+    """The motion at the end of ``blocks`` (N, 3) of poses, of which nothing was known before."""
+    one.forget()
     for k, poses in enumerate(blocks):
         state = one.block(k, 20 * MS * k, SLOTS, poses)
     assert state is not None
@@ -59,18 +59,17 @@ def noise_of_poses(a: int, b: int) -> FloatArray:
     return out
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('count', [1, 2])
 def test_axis_covariance_is_noise_through_gains(count: int) -> None:
-    pose, velocity = np.zeros((2, count, 3, N))
+    one, (pose, velocity) = linear(), np.zeros((2, count, 3, N))
     for block in range(count):
         for axis in range(3):
             for sample in range(N):
                 blocks = [np.zeros((N, 3)) for _ in range(count)]
                 blocks[block][sample, axis] = 1.0
-                state = after(blocks)
+                state = after(one, blocks)
                 pose[block, axis, sample], velocity[block, axis, sample] = state.pose[axis], state.velocity[axis]
-    state = after([np.zeros((N, 3))] * count)
+    state = after(one, [np.zeros((N, 3))] * count)
     for a, b in ((0, 1), (0, 2), (1, 2)):
         noise = noise_of_poses(a, b)
         both = [sum(float(g[a] @ noise @ g[b]) for g in gains) for gains in (pose, velocity)]
@@ -78,6 +77,12 @@ def test_axis_covariance_is_noise_through_gains(count: int) -> None:
         np.testing.assert_allclose(found, both, rtol=1e-9)
         assert state.covariance[b, a] == state.covariance[a, b]
         assert state.velocity_covariance[b, a] == state.velocity_covariance[a, b]
+
+
+def test_what_is_said_ahead_has_the_time_of_then() -> None:
+    state = of(filter_ahead=1.0).block(0, 5, SLOTS, np.zeros((N, 3)))
+    assert state is not None
+    assert state.t_ns == 5 + 1_009_500_000
 
 
 def test_acceleration_after_block_moves_nothing_before() -> None:
@@ -188,6 +193,61 @@ def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> No
         np.testing.assert_allclose(covariance, expected[1], rtol=1e-5, atol=1e-18)
         assert squares == pytest.approx(expected[2], rel=1e-6)
         assert size == pytest.approx(expected[3], abs=1e-6)
+
+
+def test_filter_weighs_rates_by_how_well_they_predict() -> None:
+    """Bayes' rule over 23 Kalman filters, 13 of a load that steps and 10 of one whose rate wanders; their mixture."""
+    r = 1e-4
+    one = ModalFilter(motion.rig_of({}), COMPLIANCE, np.eye(3, 4), r * np.eye(4)[:, :, None] * (SLOTS == 0))
+    sizes = r / 0.02 * 1e-4 * 10.0 ** np.arange(13)
+    rates = [np.array([q, 0.0]) for q in sizes] + [np.array([0.0, q / (MODE.w * 0.02) ** 2]) for q in sizes[:10]]
+    change = np.full((23, 23), 0.01 / 23)
+    for k in range(23):
+        first, last = (0, 12) if k < 13 else (13, 22)
+        change[k, k] += 0.95
+        change[k, max(k - 1, first)] += 0.03
+        change[k, min(k + 1, last)] += 0.01
+    x, p, weights = np.zeros(4), np.eye(4), np.full(23, 1.0 / 23)
+    for block, y in enumerate(np.random.default_rng(4).normal([[0.0], [0.0], [0.03], [0.02]], 0.01, (4, N))):
+        found = [by_samples(y, list(SLOTS), x, p, rate, r) for rate in rates]
+        weights = weights @ change * np.exp([-0.5 * (squares + size - found[0][3]) for *_, squares, size in found])
+        weights /= weights.sum()
+        x = sum(w * f[0] for w, f in zip(weights, found, strict=True))
+        p = sum(w * (f[1] + np.outer(f[0] - x, f[0] - x)) for w, f in zip(weights, found, strict=True))
+        state = one.block(block, 20 * MS * block, SLOTS, np.column_stack([y, y, y]))
+        assert state is not None
+        got = [state.pose[0], state.velocity[0], state.covariance[0, 0], state.velocity_covariance[0, 0]]
+        np.testing.assert_allclose(got, [x[0], MODE.w * x[1], p[0, 0], MODE.w**2 * p[1, 1]], rtol=1e-6)
+    walk = math.sqrt(sum(w * rate[0] for w, rate in zip(weights, rates, strict=True)))
+    assert one.load_walk()[0] == pytest.approx(walk / COMPLIANCE[0], rel=1e-6)
+
+
+def test_known_load_acts_from_its_stamp_on() -> None:
+    """A step response by the matrix exponential; 5 % of what it adds is doubted; the next block's load waits."""
+    known = KnownLoads((MODE, MODE, MODE), np.array(COMPLIANCE), N, PERIOD)
+    loads = [AppliedLoad(t_ns, *force) for t_ns, force in ((0, NONE), (5 * MS, (2.0, 0.0, -3.0)), (50 * MS, NONE))]
+    for load in loads:
+        known.add(load)
+    assert [known.is_new(load) for load in loads] == [False, True, False]
+    # Samples from 0.5 to 19.5 ms; the first load acted before.
+    found = known.pushed(10 * MS, first=False)
+    assert found is not None
+    size = np.array(COMPLIANCE) * [2.0, 0.0, -3.0]
+    acted = [expm(system(MODE) * (t - 5e-3))[:, 2] if t > 5e-3 else np.zeros(4) for t in PERIOD * (SLOTS + 0.5)]
+    np.testing.assert_allclose(found.samples, size[:, None] * [state[0] for state in acted], atol=1e-15)
+    np.testing.assert_allclose(found.end, size[:, None] * acted[-1], atol=1e-15)
+    np.testing.assert_allclose(found.variance, (0.05 * size) ** 2)
+    assert known.is_new(loads[1])
+    assert not known.is_new(loads[2])
+
+
+def test_innovations_have_the_band_of_their_chi_square() -> None:
+    later = Innovations((10.0, 220.0, 200.0), 200)
+    assert later.since(Innovations()) == later
+    assert later.since(Innovations((5.0, 20.0, 0.0), 100)).means() == (0.05, 2.0, 2.0)
+    # A sample's has the variance 2.
+    assert later.band(2.0) == pytest.approx((0.8, 1.2))
+    assert Innovations().band(2.0)[0] == 0.0
 
 
 MODES = (Oscillator(14.0, 0.02), Oscillator(21.0, 0.05))
