@@ -9,7 +9,15 @@ import math
 import pytest
 
 from psd_deflection.arms.compensation.robot import RobotWatch
-from psd_deflection.arms.inputs import KNOWN_S, LONGEST_LIST, KnownJoints, frame_fault, quaternion_fault, stamp_fault
+from psd_deflection.arms.inputs import (
+    KNOWN_S,
+    LONGEST_LIST,
+    KnownJoints,
+    frame_fault,
+    joints_fault,
+    quaternion_fault,
+    stamp_fault,
+)
 
 
 def test_positions_are_known_for_a_while() -> None:
@@ -17,6 +25,23 @@ def test_positions_are_known_for_a_while() -> None:
     known.notify(1.0, ['a', 'b', 'c', 'd'], [0.1, math.nan, 1e300, -0.2])
     assert {name: one.position for name, one in known.measured(1.0 + KNOWN_S).items()} == {'a': 0.1, 'd': -0.2}
     assert known.measured(1.01 + KNOWN_S) == {}
+
+
+@pytest.mark.parametrize(
+    ('names', 'positions', 'why'),
+    [
+        (['a', 'other'], [1e4, math.nan], ''),
+        (['a', 'b'], [], ''),
+        (['a', 'b'], [0.0, -1.1e4], 'b = -11000: must be finite and at most 10000'),
+        (['a', 'b'], [math.nan, 0.0], 'a = nan: must be finite and at most 10000'),
+        (['a', 'b'], [0.0], '1 positions of 2 joints'),
+        (['a', 'b', 'a'], [0.0] * 3, 'a joint is named twice'),
+        ([str(n) for n in range(1000)], [0.0] * 1000, ''),
+        ([str(n) for n in range(1001)], [0.0] * 1001, '1001 joints: must be at most 1000'),
+    ],
+)
+def test_positions_of_joints_are_told_why_not(names: list[str], positions: list[float], why: str) -> None:
+    assert joints_fault(names, positions, ('a', 'b')) == why
 
 
 @pytest.mark.parametrize('period', [0.002, 0.01, 0.1, 0.3])

@@ -77,6 +77,10 @@ def test_lost_block_of_other_link_leaves_gap_beside_it() -> None:
     assert all(j.missing == (1,) and j.tips == () for j in got if j.missing)
     assert joiner.missing == [0, 2]
     assert joiner.joined == 7
+    # Three blocks that are not neighbours tell nothing of a curve.
+    (after,) = (j.tips[1] for j in got if j.t_ns == 6 * BLOCK_NS)
+    u = 13 / 20
+    assert after.covariance == pytest.approx((u**2 + (1 - u) ** 2) * np.reshape(NOISE, (3, 3)))
 
 
 def test_ended_link_is_dropped_and_joins_on_return() -> None:

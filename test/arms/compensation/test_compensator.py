@@ -19,7 +19,8 @@ from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm
 from psd_deflection.arms.compensation.compensator import UNVERIFIED, Command, Compensator, Observed, State
-from psd_deflection.arms.compensation.settings import CompensatorSettings
+from psd_deflection.arms.compensation.response import JointResponse
+from psd_deflection.arms.compensation.settings import CompensatorSettings, ShaperSettings
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 from test.altered import altered
@@ -132,15 +133,17 @@ def test_dry_it_proposes_what_it_would_command(arm: Arm) -> None:
     assert dry.error() > 30 * wet.error()
 
 
-def test_offsets_stay_within_their_limits(arm: Arm) -> None:
-    loop = Loop(arm, max_offset=1e-3, max_rate=0.002)
+@pytest.mark.parametrize('rate', [0.002, 0.1])
+def test_offsets_stay_within_their_limits(arm: Arm, rate: float) -> None:
+    """It says so if either limit is reached, also the largest offset alone."""
+    loop = Loop(arm, max_offset=1e-3, max_rate=rate)
     loop.plant.force = PAYLOAD
     loop.run(1.0)
     loop.compensator.enable(True)
     before = loop.offsets
     for _ in range(80):
         command = loop.run(PERIOD)
-        assert np.abs(command.offsets - before).max() <= 0.002 * PERIOD * (1 + 1e-9)
+        assert np.abs(command.offsets - before).max() <= rate * PERIOD * (1 + 1e-9)
         before = command.offsets
     assert np.abs(before).max() == pytest.approx(1e-3)
     assert command.limited
@@ -296,12 +299,31 @@ def test_settings_are_checked(chosen: dict[str, object], message: str) -> None:
         CompensatorSettings(**chosen)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    'name', ['max_offset', 'max_rate', 'damping', 'max_sd', 'jump', 'max_deflection', 'max_joint_speed', 'follow_error']
-)
-def test_no_limit_is_nothing(name: str) -> None:
-    with pytest.raises(ConfigError, match=f'{name} = 0.0 .*must be above 0'):
-        CompensatorSettings(**{name: 0.0})  # type: ignore[arg-type]
+LARGEST = dict.fromkeys(('max_offset', 'max_rate', 'damping', 'max_sd', 'jump', 'max_deflection', 'follow_error'), 10.0)
+MOST = {
+    'max_joint_speed': 1000.0,
+    **LARGEST,
+    'time_constant': 100.0,
+    'stale': 10.0,
+    'good': 10_000,
+    'release_after': 1e6,
+}
+OF_SHAPER = {'frequency': 1000.0, 'max_step': 10.0, 'lead': 1.0}
+
+
+@pytest.mark.parametrize(('name', 'most'), [*MOST.items(), *OF_SHAPER.items()])
+def test_a_setting_is_within_its_bounds(name: str, most: float) -> None:
+    of: Any = CompensatorSettings if name in MOST else ShaperSettings
+    assert getattr(of(**{name: most}), name) == most
+    with pytest.raises(ConfigError, match=f'{name} = .*at most'):
+        of(**{name: most + 1 if name == 'good' else most * 1.001})
+    if name in LARGEST or name == 'max_joint_speed':
+        with pytest.raises(ConfigError, match=f'{name} = 0.0 .*must be above 0'):
+            of(**{name: 0.0})
+
+
+def test_bending_is_shaped_unless_modes_are_named() -> None:
+    assert ShaperSettings().modes == ('bending',)
 
 
 def test_before_the_first_deflection_there_is_no_offset(arm: Arm) -> None:
@@ -404,6 +426,23 @@ def test_time_counts_from_when_the_last_one_was_sent(arm: Arm) -> None:
     loop.compensator.sent(loop.t + 0.05, first)
     second = loop.compensator.watch(loop.t + 0.06)
     assert np.abs(second.offsets - first.offsets).max() == pytest.approx(0.1 * 0.01)
+    # After a pause it is one of a tenth of a second at most.
+    loop = following(arm, max_rate=0.01)
+    loop.compensator.enable(False)
+    before = loop.offsets
+    assert np.abs(loop.compensator.watch(loop.t + 5.0).offsets - before).max() == pytest.approx(0.01 * 0.1)
+
+
+def test_a_fit_of_more_than_a_minute_begins_anew() -> None:
+    """A controller that adds half of an offset, after one that added all of it: a fit of both would say more."""
+    response, slopes = JointResponse(1), []
+    response.begin(np.zeros(1))
+    for t in np.arange(0.0, 66.0, 0.02):
+        first, later = 0.02 * np.clip([t - 1.0, t - 64.0], 0.0, 0.5)
+        response.add(t, np.array([first + 0.5 * later]), np.array([first + later]), 0.01)
+        slopes.append(response.slopes[0])
+    assert slopes[150] == pytest.approx(1.0, abs=1e-6)
+    assert slopes[-1] == pytest.approx(0.5, abs=1e-6)
 
 
 def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:

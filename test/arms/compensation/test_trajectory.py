@@ -211,8 +211,10 @@ def test_a_jump_under_way_is_rejected_and_nothing_changes() -> None:
     with pytest.raises(ConfigError, match=r'begins .* from where shoulder is commanded'):
         by.shape(round(0.2 * S), far, ZERO)
     there = moved(1).at(np.array([0.2]))[0]
-    again = checked(NAMES, [0.0], [[there[0].tolist(), [], []]])
-    assert by.shape(round(0.2 * S), again, ZERO).states[0, 0, 0] < there[0, 0]
+    again = checked(NAMES, [0.0], [[(there[0] + 0.01).tolist(), [], []]])
+    shaped = by.shape(round(0.2 * S), again, ZERO)
+    assert shaped.states[0, 0, 0] < there[0, 0]
+    assert shaped.states[-1, 0].tolist() == (there[0] + 0.01).tolist()
 
 
 def test_limits_of_the_arm_are_those_of_its_file() -> None:

@@ -225,10 +225,12 @@ def test_filter_weighs_rates_by_how_well_they_predict() -> None:
 def test_known_load_acts_from_its_stamp_on() -> None:
     """A step response by the matrix exponential; 5 % of what it adds is doubted; the next block's load waits."""
     known = KnownLoads((MODE, MODE, MODE), np.array(COMPLIANCE), N, PERIOD)
-    loads = [AppliedLoad(t_ns, *force) for t_ns, force in ((0, NONE), (5 * MS, (2.0, 0.0, -3.0)), (50 * MS, NONE))]
+    loads = [
+        AppliedLoad(t_ns, *force) for t_ns, force in ((0, NONE), (5 * MS, (2.0, 0.0, -3.0)), (50 * MS, (1.0, 0.0, 0.0)))
+    ]
     for load in loads:
         known.add(load)
-    assert [known.is_new(load) for load in loads] == [False, True, False]
+    assert [known.is_new(load) for load in loads] == [True, True, False]
     # Samples from 0.5 to 19.5 ms; the first load acted before.
     found = known.pushed(10 * MS, first=False)
     assert found is not None
