@@ -54,9 +54,11 @@ def test_two_lenses_leave_two_parallel_beams_apart() -> None:
     assert dots_apart(0.010, (0.100, 0.025), between=0.0, path=0.020) == pytest.approx(0.0, abs=1e-15)
 
 
-@pytest.mark.slow
 def test_failed_laser_costs_certainty_or_warm_up() -> None:
-    both, out, alone, cold, spare = simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.5))
+    """The link swings slowly and for ever: an estimate is held against the pose in the middle of its block."""
+    rig = load_rig(None, {'dynamics.bending_frequency': 1.0, 'dynamics.bending_damping_ratio': 0.0})
+    both, out, alone, cold, spare = simulated(rig, Lasers((1e-3, 1e-3), 1e-3, 0.5))
+    assert both.scatter == pytest.approx(both.deviations, rel=0.3)
     assert [p.estimates for p in (both, out, alone, cold, spare)] == [1.0, 1.0, 1.0, 0.0, 1.0]
     assert cold.status is BlockStatus.LASER_LOST
     assert out.message == 'one of the two lasers is out: half the light on both detectors'
@@ -67,7 +69,7 @@ def test_failed_laser_costs_certainty_or_warm_up() -> None:
     assert max(p.largest for p in (both, out, alone, spare)) < 5.0
     # Where the dots leap, the tip seems to: half a dot's distance if both shone, all of it for a spare.
     assert [p.off[0] for p in (both, out, alone, spare)] == pytest.approx([0.0, -5e-4, 0.0, -1e-3], abs=1e-6)
-    assert [p.name for p in simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.0))][-2:] == ['laser 1 alone', 'its spare']
+    assert [p.name for p in simulated(rig, Lasers((1e-3, 1e-3), 1e-3, 0.0))][-2:] == ['laser 1 alone', 'its spare']
 
 
 def test_half_the_light_halves_the_sum_and_doubles_the_noise() -> None:
