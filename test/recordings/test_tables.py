@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +20,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.recordings.charts import estimates_chart, moments, samples_chart
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.sample_table import sample_dtype, samples_table
+from psd_deflection.recordings.sample_table import digest_of, sample_dtype, samples_table
 from psd_deflection.recordings.spans import span_ns
 from psd_deflection.records import AppliedLoad, Mark, ReferencePose, TemperatureReading
 from psd_deflection.studies.study import opened
@@ -56,6 +59,12 @@ def test_series_axes_are_columns_from_first_estimate() -> None:
     assert len(series(0).t) == 0
 
 
+def test_pandas_and_xarray_wait_until_they_are_asked_for() -> None:
+    code = 'import sys, psd_deflection.recordings.estimates; print({"pandas", "xarray"} & {*sys.modules})'
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == 'set()\n'
+
+
 def test_a_table_has_the_columns_that_there_are() -> None:
     made = series()
     names = [c.name for c in made.table().columns]
@@ -90,6 +99,17 @@ def test_loads_are_held_and_references_stand_once() -> None:
     assert [c for c in columns if c.startswith('temp')]
     (warm,) = [columns[c] for c in columns if c.startswith('temp')]
     np.testing.assert_array_equal(warm, [np.nan, np.nan, np.nan, 21.5])
+
+
+def test_digest_is_that_of_the_bytes_of_all_files(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 5000
+    for name, part in (('b', content[1000:]), ('a', content[:1000])):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'file').write_bytes(part)
+    assert digest_of(tmp_path) == hashlib.sha256(content).hexdigest()
+    assert digest_of(tmp_path / 'a' / 'file') == hashlib.sha256(content[:1000]).hexdigest()
+    with pytest.raises(RecordingError, match='gone: cannot be read'):
+        digest_of(tmp_path / 'gone')
 
 
 def test_repeated_mark_is_the_first_after_the_start() -> None:
@@ -161,6 +181,7 @@ def test_every_channel_is_drawn_with_the_marks() -> None:
     samples['y2'] = [1.0, 2.0, 3.0]
     chart = samples_chart(samples, 2, moments([Mark(5_250_000_000, 'bump')], 5_000_000_000))
     assert [panel.y_label for panel in chart.panels] == [f'{n} / V' for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')]
+    assert [panel.curves[0].colour for panel in chart.panels] == [*['blue'] * 3, *['orange'] * 3]
     words = ['bump', *[''] * 5]
     assert [[(rule.at, rule.words) for rule in rules] for rules in chart.rules()] == [[(0.25, w)] for w in words]
     (curve,) = chart.panels[4].series

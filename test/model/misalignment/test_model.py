@@ -24,7 +24,7 @@ from psd_deflection.model.misalignment.model import (
     readings,
     response_of,
 )
-from psd_deflection.model.misalignment.rig import CLAMP, known_of_rig, rig_values, vector_of_rig
+from psd_deflection.model.misalignment.rig import CLAMP, dots_by_parameters, known_of_rig, rig_values, vector_of_rig
 from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_to_values
 from psd_deflection.model.simulation.declaration import CALIBRATED_OF_LINK, CALIBRATED_OF_PSD, PLACED_OF_PSD
 from psd_deflection.records import FloatArray
@@ -64,6 +64,21 @@ def test_the_derivatives_are_those_of_the_readings(truth: dict[str, float], pose
         assert ours[:, i] == pytest.approx(slope, rel=1e-4, abs=1e-10 / TOLERANCES[i]), ALL[i].name
     flat = by_pose(p, np.zeros((3, 1)), LENGTH)[:, :, 0]
     assert flat == pytest.approx(np.array([[-1, 0, 0.07], [0, -1, 0], [-1, 0, 0], [0, -1, 0.1]]), abs=0.03)
+
+
+def test_error_of_a_parameter_moves_corrected_dots(truth: dict[str, float], poses: FloatArray) -> None:
+    """What is read by the true parameters, corrected by wrong ones, of a strongly bent response."""
+    p = vector_of(truth)
+    p[INDEX['psd_1.nonlinearity']] = p[INDEX['psd_2.nonlinearity']] = 8000.0
+    ours = dots_by_parameters(p, poses, LENGTH)
+    for i in range(COUNT):
+        step = np.zeros(COUNT)
+        step[i] = 1e-2 * TOLERANCES[i]
+        ends = []
+        for read in (readings(p + step, poses, LENGTH), readings(p - step, poses, LENGTH)):
+            ends.append(np.concatenate([response_of(p, n).place(read[2 * n], read[2 * n + 1]) for n in (0, 1)]))
+        slope = (ends[0] - ends[1]) / (2.0 * step[i])
+        assert pytest.approx(slope, rel=1e-4, abs=1e-10 / TOLERANCES[i]) == ours[:, :, i].T, ALL[i].name
 
 
 def test_a_place_is_read_and_found_again(truth: dict[str, float]) -> None:

@@ -218,7 +218,18 @@ def test_a_long_history_is_simulated_in_pieces(monkeypatch: pytest.MonkeyPatch) 
         assert [at.start for at, _ in pieces] == [sum(sizes[:i]) for i in range(len(sizes))]
         full = ForwardModel(load_rig(), effects).expect(steps, warm).volts
         assert np.array_equal(np.concatenate([volts for _, volts in pieces], axis=1), full)
-    assert list(ForwardModel(load_rig(), []).expect_in_pieces(steps[:0], None)) == []
+    assert list(ForwardModel(load_rig(), [at_once]).expect_in_pieces(steps[:0], None)) == []
+
+
+def test_what_no_converter_reads_is_at_the_ends_of_its_range() -> None:
+    """A load of 20 kN moves the dots by nearly a metre."""
+    rig = load_rig()
+    history = np.repeat([[0.0, -2e4, 0.0], [0.0, 2e4, 0.0]], 30, axis=0)
+    counts = RigSimulator(rig).step(history).counts
+    assert (counts.min(), counts.max()) == (-32768, 32767)
+    assert np.array_equal(counts, RigSimulator(rig, 0).step(history).counts)
+    volts = ForwardModel(rig).expect(history).volts
+    np.testing.assert_allclose([volts.min(), volts.max()], rig.converter.volts_per_count * np.array([-32768, 32767]))
 
 
 def test_what_is_taken_between_the_samples_has_that_time() -> None:
