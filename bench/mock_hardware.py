@@ -3,8 +3,6 @@
 """Compensator and shaper with the real controllers of ros2_control, on hardware that is
 mock_components/GenericSystem."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A named tuple with other values, as ``dataclasses.replace`` and Python 3.13's ``copy.replace`` have it."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 Record = TypeVar('Record', bound=tuple[Any, ...])

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long a test waits for what will come."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorder that joins late: what it hears from then on, written as rosbag2 does, without metadata of ours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple

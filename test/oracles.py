@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The judges: golden answers of an independent audit, and a ray/plane simulator that shares no code."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

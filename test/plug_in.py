@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Installs a made-up package into a folder that this process and those that it starts look into."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

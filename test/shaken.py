@@ -9,8 +9,6 @@ asks whether the same computation gives the same answer again on one machine: th
 answer.
 """
 
-from __future__ import annotations
-
 import functools
 import zlib
 from collections.abc import Callable, Iterable

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of samples and what pipelines make of them: the set-up that tests of many rooms share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The functions at the top of the package, and the tables that they give."""
 
-from __future__ import annotations
-
 import copy
 import html
 import importlib.util

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The golden recordings of ``bags/``: replayed on every run, held against their truth."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

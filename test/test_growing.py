@@ -7,8 +7,6 @@ did not choose itself (a key that is no constant, an element that is appended), 
 deque with ``maxlen``), or stands in the table below with what bounds it.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The layouts of Foxglove, PlotJuggler and RViz and the SROS 2 policy name what there is."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigs of three and more PSDs from the rig file to the estimate: by truth, with one PSD failing, bit for bit again."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a wheel installs is what ``ros2 run`` looks for; tables agree; what a release must not have is noticed."""
 
-from __future__ import annotations
-
 import ast
 import configparser
 import importlib.metadata

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rooms: what their lines allow, which tests should notice their mutants, and no class name for two things."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

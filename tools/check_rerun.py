@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Converts recordings for Rerun, reads them with its own reader and looks at its picture (``make demo NAME=rerun``)."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

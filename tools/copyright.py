@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """ament_copyright, which knows long headers alone, with our two lines added: ``python -m tools.copyright PATH...``."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``make mutants``: break the numerics one line at a time, and see whether a test notices."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import hashlib

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is believed of messages of joints, and of a robot's drivers."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

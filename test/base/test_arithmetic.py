@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arithmetic in an order of its own: right, the same for floats and arrays, and used wherever bits are promised."""
 
-from __future__ import annotations
-
 import ast
 import math
 from concurrent.futures import ThreadPoolExecutor

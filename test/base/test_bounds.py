@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bounds of what others can make grow."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

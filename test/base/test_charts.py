@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A declared chart on a page and as a figure of matplotlib; what is shown of the axes of the tip."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML and numbers of a stranger: plain types, bounded, one reading, and no exception but the declared one."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from pathlib import Path

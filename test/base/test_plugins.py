@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever a plug-in does on import ends in one error that names it, for every group of entry points."""
 
-from __future__ import annotations
-
 import ast
 from importlib.metadata import EntryPoint
 from pathlib import Path

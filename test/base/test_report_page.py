@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The charts of a report in headless Chromium: cursor, zoom, switches, keys; nothing asked for, nothing complained."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sequence numbers past 32 bits: gaps, repeats, wraps, restarts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

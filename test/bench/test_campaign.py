@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The campaigns of ``bench/campaign``, a few rounds of each: they must be able to run, and to fail."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the CPU time goes: parts without what is inside them, threads without gaps, kinds of native code."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

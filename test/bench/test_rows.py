@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rows of ``make bench``: their ratios and bounds, the file that keeps them, and the page that is made of it."""
 
-from __future__ import annotations
-
 import pytest
 
 from bench import cpu, page

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A slice of the blind suite, the second generator against integrators and the simulation, the scores."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

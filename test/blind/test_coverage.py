@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A short form of ``python -m blind.coverage``: the truth is inside the published intervals as often as they say."""
 
-from __future__ import annotations
-
 import pytest
 
 from blind.coverage import ROWS, UNEQUAL, Inside, fault, on_a_moving_base, over_the_bound, score, warming

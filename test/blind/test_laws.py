@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The laws of the blind suite: drawn as stated, scored as stated, and a short form of the campaign."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

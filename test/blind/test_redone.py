@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The short form of ``make demo NAME=thesis``: 50 N, few frames, and the page."""
 
-from __future__ import annotations
-
 import json
 from html.parser import HTMLParser
 from pathlib import Path

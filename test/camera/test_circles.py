@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's three discs: what is rendered is found again, within what is claimed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames from folders, videos and ROS images: their sizes before anything is unpacked, and the work one causes."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of the camera by themselves: headers, pixel formats, sectors of a rim, bounds of a fit, words."""
 
-from __future__ import annotations
-
 import math
 import struct
 from types import SimpleNamespace

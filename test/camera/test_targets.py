@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every kind of target must do: its print, photographed, is found again; it says its own sizes and no other's."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

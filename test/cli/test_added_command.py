@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Another package adds a command and a study: `psd-deflection NAME` runs them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``chain``, ``compensator`` and ``shaper`` without ROS, and commands that need it on a machine without it."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``budget``, ``design`` and ``certificate``: what they print, draw and reject; the tables alone give every U."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``psd-deflection camera``: a folder of frames to CSV and to a bag."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: help that teaches, options, completion, and one clear line for what goes wrong."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

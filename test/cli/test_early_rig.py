@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated rig's process, started before its daemon is ready for it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``effects``: the catalogue as a list, and each effect with a command that shows it."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

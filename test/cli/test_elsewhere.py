@@ -5,8 +5,6 @@
 Here it runs without what only Unix has: those modules cannot be imported, and those names are gone.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``info``, ``convert`` and ``plot``."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

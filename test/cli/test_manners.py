@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a script relies on: exit status, one line of error, JSON alone on stdout, whole outputs, printable words."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

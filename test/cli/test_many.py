@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands that take many recordings: the same answers on every engine, failures listed, the rest done."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Iterator

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``calibrate``, ``identify`` and ``validate`` from files to files, and what they reject."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``psd-deflection thesis compare-methods``: the tables, the figures, and that the page on methods has them all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -7,8 +7,6 @@ that passes only while somebody waits, so that a device is never late and waits 
 sources that measure how quick the device is, whatever else the machine does.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence

@@ -6,8 +6,6 @@ It is the page's judge: where the daemon does not get on with it, page or daemon
 program and it prints the name of its port.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """DATAQ converters: replies and scans written by hand, and the simulated device on a line of our own."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import struct

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages on devices print is what the code takes; the second emulator against the daemon."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

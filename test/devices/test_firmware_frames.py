@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The firmware's own COBS and CRC, compiled for this machine, against ours: byte for byte, both ways."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

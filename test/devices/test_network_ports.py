@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the parameter ``port`` may name; ports of the network against real sockets on this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

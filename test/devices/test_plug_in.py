@@ -5,8 +5,6 @@
 The page's own code and entry point are installed into a folder that this process and those that it starts look into.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds for every device that is declared, whoever adds one."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording as a device: paced by a clock that the test owns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sources by name, plug-ins included, and what the reader makes of a source's own kinds of time."""
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``devices``: what answers on a port, from the simulated devices and from none."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from types import SimpleNamespace

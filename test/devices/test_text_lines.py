@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lines of text: written by hand, and the simulated device on a pseudo-terminal."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thorlabs aligners: messages written by hand, and the simulated pair on lines of our own."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a reader takes from docs/deploy and docs/ci.md is understood by the programs that read it, and runs."""
 
-from __future__ import annotations
-
 import configparser
 import re
 import shutil

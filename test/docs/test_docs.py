@@ -5,8 +5,6 @@
 What ends in a moment is run here; ``make docs STEP=commands`` runs the rest (tools/run_commands.py), and CI runs both.
 """
 
-from __future__ import annotations
-
 import doctest
 import json
 import os

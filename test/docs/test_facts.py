@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pages state is what the program says: figures, files, options, defaults, lines to paste."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -5,8 +5,6 @@
 ``make docs STEP=try-page`` runs it in Chromium.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

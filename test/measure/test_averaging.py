@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks by sequence number: a loss shortens one block and shifts none; in any number at a time, the same bits."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Corrected dots and the uncertainty of an estimate, by formulas written again and rules of one line."""
 
-from __future__ import annotations
-
 import cmath
 import math
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults of the optics one by one, what the node makes of one detector alone, and that replay agrees."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

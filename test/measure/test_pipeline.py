@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pipeline on simulated samples: its accuracy against the bound, and what it rejects."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator

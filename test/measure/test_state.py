@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the parts of the pipeline remember: each takes its own, and what fits none is said."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Device clock to host time: the figures of docs/robustness.md, on a simulated USB line."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

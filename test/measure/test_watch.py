@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch: what it sees, what it passes over, and the short form of its campaign."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

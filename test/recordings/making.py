@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records of every kind, made up for the tests of recordings; files of them, and whether they came back."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

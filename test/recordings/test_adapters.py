@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records to message fields and back, with rosbags' own message store as the judge of the bytes."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

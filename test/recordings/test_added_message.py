@@ -5,8 +5,6 @@
 The package is copied, the two are added to the copy, and a program of its own records with it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

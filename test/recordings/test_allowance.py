@@ -5,8 +5,6 @@
 Work is counted, not timed: calls, bytes unpacked, bytes read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import struct

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of ours and of others, whole and made up, as the reader gives them back."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path

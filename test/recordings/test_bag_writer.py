@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What we write, read by readers that are not ours: rosbags and mcap."""
 
-from __future__ import annotations
-
 import collections
 import errno
 import gc

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our bytes are those of an independent encoder, message by message."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import struct

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rounding is distinguished from other differences, and who made the recording decides whether it may be there."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Mapping
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The committed recordings, held against what other people's programs rely on, by readers not ours."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """CSV recordings in and out."""
 
-from __future__ import annotations
-
 import math
 import os
 from decimal import Decimal

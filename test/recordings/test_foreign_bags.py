@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of others: ``ros2 bag record`` or ``convert``, reindexed, copied by hand, from stepped clocks."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Sequence

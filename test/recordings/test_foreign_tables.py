@@ -6,8 +6,6 @@ it.
 Made anew in the forms that public reports describe; no row is anybody's.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP files, written and read: the package ``mcap`` is the judge."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

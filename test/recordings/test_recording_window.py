@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A part of a recording is a recording; marks are read, listed, drawn, converted, and bound a part."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

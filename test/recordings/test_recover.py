@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags that were cut off or spoiled: what can be read comes back, and ``recover`` makes it whole for strict readers."""
 
-from __future__ import annotations
-
 import fcntl
 import struct
 import subprocess

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of references: read as they are written, rejected with file, line and value."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

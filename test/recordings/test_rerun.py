@@ -5,8 +5,6 @@
 ``make demo NAME=rerun`` reads the files with Rerun's own reader and looks at its picture.
 """
 
-from __future__ import annotations
-
 import itertools
 import sys
 from dataclasses import replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings and estimates as Python's own things, as tables and series row by row, and as figures."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys

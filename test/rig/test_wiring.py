@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The wiring of a rig file: which channel is which axis, applied alike to live samples and recorded ones."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real rclpy and real DDS: a domain of its own for each worker, and the daemon as a process."""
 
-from __future__ import annotations
-
 import fcntl
 import math
 import os

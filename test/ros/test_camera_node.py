@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``camera``: images in, references and diagnostics out."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 from typing import Any

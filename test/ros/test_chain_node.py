@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two simulated rigs in one node: the end effector and each link over real DDS."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

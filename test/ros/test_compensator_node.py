@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop closed over real DDS: a simulated arm of two links, its deflection, and the offsets of its joints."""
 
-from __future__ import annotations
-
 import copy
 import math
 import os

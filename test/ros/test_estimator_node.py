@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as a process of its own, seen from a second participant with its own rclpy."""
 
-from __future__ import annotations
-
 import array
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gate: what is bounded before it is unpacked, and who is told that his messages do not come."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, cast
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which messages of other nodes a session takes, and why it does not take the others."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any

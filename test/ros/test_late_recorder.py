@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Over real DDS: what a late recorder and the filter's topics give replays bit for bit."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

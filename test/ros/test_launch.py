@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files: their arguments reach the node."""
 
-from __future__ import annotations
-
 import runpy
 import shutil
 import subprocess

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's states, its zero from run to run, and its end in every state."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shaper's action over real DDS: goals in, the same to the controller, shaped, and what it says of them back."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

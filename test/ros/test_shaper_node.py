@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shaper over real DDS: a trajectory in, the shaped one out, played on the simulated arm."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of topics is whole: nothing is published or heard beside it."""
 
-from __future__ import annotations
-
 import ast
 import functools
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What viewers are given: the tree of frames, latched markers and geometry, the robot's description."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import sys

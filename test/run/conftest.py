@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A device whose every byte the test writes, on a pseudo-terminal that the daemon opens."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

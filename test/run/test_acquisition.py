@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reader against a device whose every byte the test writes."""
 
-from __future__ import annotations
-
 import itertools
 import queue
 import time

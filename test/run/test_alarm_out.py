@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Alarms handed on: a real program and a real web server on this machine."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration while the recording is being written."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two rigs in one process, and the end effector composed of them."""
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable, Iterator

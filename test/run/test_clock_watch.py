@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the clock map is shown of a stream, with times that the test owns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A disk that hangs: estimates flow on meanwhile, and every request gets a true answer."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gate for what a device says of itself, at the start and when it starts anew."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

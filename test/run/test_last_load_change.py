@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When the link moved last, as the daemon finds it in the last minute."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

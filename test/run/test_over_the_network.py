@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reader on ports of the network: what it does on a serial line, it does over TCP; and over UDP with its faults."""
 
-from __future__ import annotations
-
 import select
 import socket
 import threading

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pings: when they are due, whose answer counts, and when they end."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pipeline's thread: requests that come late, and how long blocks took."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor, wait

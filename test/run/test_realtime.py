@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is asked of a system that rejects; systemd's socket; lines that come again and again."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder against a disk that fills, rejects, or is slow."""
 
-from __future__ import annotations
-
 import errno
 import os
 import queue

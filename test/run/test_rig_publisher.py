@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What ``/link_tip/rig`` says of the pipeline's memory: enough for a recorder that joins at any block."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is asked of a session while its device is there, away, or silent."""
 
-from __future__ import annotations
-
 import queue
 import time
 from collections.abc import Callable, Iterator

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a run ends: by signals, and when a part hangs or does not keep up: not waited for long, losses are told."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated rig rests until a load is noted, which it hangs; the guided check on it, and where nothing is."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable

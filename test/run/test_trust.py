@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/trust.md against the texts of the package: no correction without its row, no row without its line."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch in a run: what it says, and the recording that it keeps."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kept zero: what is taken back, and what is passed over with a line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads held one after the other, what a device reads under them, and what each study says of their notes."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two lasers over one beam splitter: the rules of the thesis by hand, and what the pipeline does when one fails."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

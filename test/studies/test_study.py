@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every result of a study draws itself, and is a table."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping

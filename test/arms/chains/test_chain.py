@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Composed deflections beside an independent finite-element frame (PyNite), and their covariance beside chance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

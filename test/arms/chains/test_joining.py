@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The file of a chain, and estimates of its links, whose blocks do not coincide, at common times."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

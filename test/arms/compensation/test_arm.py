@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kinematics of a URDF file: beside those of the chain, and by finite differences."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

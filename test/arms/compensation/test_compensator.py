@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The offsets: what they reach, their limits, and when they hold."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Input shapers against a mode that scipy simulates; shaped trajectories: values, limits, what is rejected."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Consistent Overhead Byte Stuffing, judged by the package ``cobs``."""
 
-from __future__ import annotations
-
 import cobs.cobs as cobs_oracle
 import pytest
 from hypothesis import given

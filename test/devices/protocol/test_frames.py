@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The frames of docs/protocol.md. The bytes of the case table were written down, not encoded by us."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

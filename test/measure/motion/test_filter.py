@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter: its tables beside a Kalman filter, covariances beside sums over its gains, loads acting unseen."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What known accelerations of the base do, against an integration of the equation of motion by scipy."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter in the pipeline: against the truth of a generator of its own, without samples, and in a replay."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What joins noise, fit and check: each part asked by itself, against what it should say."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fit through one block: exact on what it can follow, the mean where nothing moves, honest about its variance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

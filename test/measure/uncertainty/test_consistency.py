@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check of the readings of two and of more PSDs, against least squares with dense matrices of numpy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise of the stream: right in size and colour, deaf to motion, not below the steps of the converter (found, too)."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the pipeline remembers of noise, motion and contradictions: told in memory(), and then no bit differs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What vibrates faster than a block: found by its tone, not taken for noise, and never seen where there is none."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a block stops being good: each limit from both sides, in numbers worked out by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

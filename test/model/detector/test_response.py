@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One model of the detector: simulation, correction, calibration and budget give the same reading."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

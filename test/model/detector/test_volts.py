@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts to volts to metres; photocurrents to places and back; what not to believe."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

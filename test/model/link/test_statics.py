@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Link statics both ways, and the cross-section they rest on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model of the readings against the optics of blind/, its derivatives, and a rig file's effects as parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

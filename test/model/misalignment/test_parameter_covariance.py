@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The covariance of a calibrated rig: against many rigs whose parameters are wrong by what the file says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sensor placement: condition numbers, gains, spreads in closed form and by the matrix, and the search."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

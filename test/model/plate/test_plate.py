@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose to dots and back, lasers on the plate, beams that lean: against rays in space, and golden readings."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

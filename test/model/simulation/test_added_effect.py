@@ -5,8 +5,6 @@
 The effect is the one of docs/simulation.md, "Add an effect", so that the page is tried as well.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

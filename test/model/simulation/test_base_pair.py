@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """PSDs at the base, lasers on the plate: simulated, recorded, replayed and solved; contradictions are rejected."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

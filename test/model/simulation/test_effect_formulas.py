@@ -7,8 +7,6 @@ the link. An effect that is added to the catalogue needs a second formula too: w
 fails.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

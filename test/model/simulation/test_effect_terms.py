@@ -6,8 +6,6 @@
 two sizes and with either sign, so that no term hides behind another.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 from collections.abc import Mapping

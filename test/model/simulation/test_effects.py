@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue: complete, declared, and each effect off when off, on when on, the same in pieces."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws in YAML: read, written, simulated in pieces, corrected, rejected with file and key."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The forward model against closed forms, an independent integrator, and itself in pieces."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every method, and the simulator that judges them, against the golden answers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds for every method: one block and many agree, geometry is checked, it converges or says that it does not."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from typing import Any

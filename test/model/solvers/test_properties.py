@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any pose in range comes back, through a simulator that shares no code; turning the rig turns the answer."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A method joins by its module and one line of the registry; what is for comparison only does not run live."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import MappingProxyType

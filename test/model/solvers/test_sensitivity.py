@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How an answer goes with each dot, by differences of the answers, is the judge of every stated gain and covariance."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The covariance is the one the answers have, 95 % intervals hold 95 %; statements of the audit that are no number."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

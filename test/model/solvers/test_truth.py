@@ -5,8 +5,6 @@
 The model is that of ``rays`` in space, its derivatives are differences, and the normal equations are dense.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

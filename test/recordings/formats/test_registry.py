@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every format must do, ours and the one that ``docs/recording.md`` says to add."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which recordings a command line means; tasks on engines: order, failures, killed workers."""
 
-from __future__ import annotations
-
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Headless Chromium, driven by its own driver."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

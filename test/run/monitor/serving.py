@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A server whose source and clock are the test's."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """No page of ours has a violation that axe-core finds: colours, names, labels, landmarks, order of headings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import pytest

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page in headless Chromium, before the real daemon and the simulated rig."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import importlib.util

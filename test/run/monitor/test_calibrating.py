@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A calibration that the page starts: a real process, which speaks to the page's server."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands that speak to a running daemon without ROS."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

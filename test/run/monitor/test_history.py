@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells against the rows that they are made of, through wraps, gaps and clocks that are set."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page's windows of hours in headless Chromium: what the daemon remembers, drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

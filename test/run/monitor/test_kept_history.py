@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the page's hours are after a restart, and what a bad file or disk does to them."""
 
-from __future__ import annotations
-
 import contextlib
 import sqlite3
 import threading

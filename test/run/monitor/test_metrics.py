@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``/metrics`` as Prometheus reads it: its own parser is the judge."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

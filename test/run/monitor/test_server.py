@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The server as any client sees it: what it sends, whom it obeys, and what is said before it starts."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json

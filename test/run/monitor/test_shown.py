@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the page is sent of samples and estimates."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import json

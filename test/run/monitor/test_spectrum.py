@@ -1,7 +1,5 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-from __future__ import annotations
-
 import json
 import re
 

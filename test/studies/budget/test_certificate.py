@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A certificate of a calibration written by hand: each input against the exact model, every sum written again."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

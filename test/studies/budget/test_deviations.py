@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each error parameter: its deviation by a formula written again, and the field of the chain that it moves."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Equations 3.1 to 3.4, corrected, and the load that suits a rig, against reference values and formulas by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

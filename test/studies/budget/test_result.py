@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a budget says, shows and writes, and its expanded uncertainty, against tables and sums by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

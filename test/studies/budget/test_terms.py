@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every term: right where a closed form says it, as Monte Carlo has it, and the chain with everything wrong."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration against rigs of the second generator in blind/, whose optics are not ours."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

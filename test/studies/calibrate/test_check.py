@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check of an old calibration, against plain linear algebra, and what a calibration has determined so far."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

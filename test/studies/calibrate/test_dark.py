@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dark levels: what is measured with the lasers off, and what it takes off, against photocurrents that add."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

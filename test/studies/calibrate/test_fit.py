@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fit's pieces and its rows: against another minimiser, known polynomials, and counts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

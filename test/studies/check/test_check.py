@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check names every wrong wiring and accuses no right one; recordings come from the second generator."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

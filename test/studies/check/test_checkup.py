@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verdict, the findings and the notes of pushes, levels and drift that are made by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

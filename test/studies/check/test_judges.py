@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What check and discover both judge: the same recording gets the same words."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise, hum, light, answers to loads and what each wiring explains: of volts and pushes that are made by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The words, rows and charts of a checkup that is made by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What discover proposes, names and writes, piece by piece: against counts by hand and sentences."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from types import SimpleNamespace

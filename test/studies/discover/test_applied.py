@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What hung instead of what was noted, found by a search, and what the fourth reading says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """discover: names what was hidden, keeps silent where nothing was, and leaves files that work."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The formulas of discover, piece by piece, against the same thing written in another way."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

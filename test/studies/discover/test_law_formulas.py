@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The formulas behind a law, piece by piece: grids counted by hand, sums written out, states by brute force."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

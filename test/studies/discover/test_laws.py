@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """discover on machines of one's own, and what no effect explains as a law; nothing is adopted without the word."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparisons at their limits, guards and constants of discover: each from one side and from the other."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from types import SimpleNamespace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slow noise, the noise of a zero, and parameters that nothing determines are no effect."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from dataclasses import replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cleaning, workspace, noise, starting values, plans: each function against sums, loops and limits written here."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

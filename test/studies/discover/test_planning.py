@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a rig could tell apart, and the next recording: what it may be asked, which is chosen, when the loop ends."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plant's cases as vectors of one likelihood, and its answer: against sums, loops and least squares written here."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

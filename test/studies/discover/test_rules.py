@@ -6,8 +6,6 @@ The plant shows the sum of its effects, each a fixed picture times its size, in 
 So each answer is that of a textbook: least squares, its covariance, its loss of chi-square.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

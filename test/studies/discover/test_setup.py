@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mistakes of the set-up: each is named with its size and the line that puts it right, and nothing else is."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Sequence

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps of a search and of its localisation, on the plant of ``test_rules``, whose answers are least squares."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

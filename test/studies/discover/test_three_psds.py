@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A search on rigs of three and more PSDs: what is hidden is named on the PSD that has it."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Mapping

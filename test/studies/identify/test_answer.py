@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is said of modes that are given, by hand, and what of them reaches the rig file and the shaper."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

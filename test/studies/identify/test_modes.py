@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From poses of samples to the method that suits them; modes of links whose motion is computed elsewhere."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

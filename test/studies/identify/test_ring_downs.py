@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parts of the search for ring-downs, with motion that is known: dense least squares, limits and counts by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spectra known by hand or computed again with scipy; the likelihood of a driven link's mode, written again."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads that a person noted some seconds late: the motion says when they were hung, and every study says so alike."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Annotated times piece by piece: steps of the dots, notes paired with them, loads as they acted, and the words."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import cast

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads that swayed, that nobody noted, lost at their step or measured by a cell: every study says so alike."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

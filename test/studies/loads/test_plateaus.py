@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What hung on the link instead of what was noted: every study says so alike."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's tables cell by cell: the printed methods' errors, Appendix B, and dots of 2 mm."""
 
-from __future__ import annotations
-
 import json
 import math
 from decimal import Decimal

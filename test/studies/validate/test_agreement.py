@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bias, scale and noise of made-up differences; the fitted motion beside numpy's; what is said, printed, written."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

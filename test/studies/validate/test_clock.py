@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The offset between the clocks: right, as sure as it says; its pieces against sums by hand, integrals and scipy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The comparison as a whole and what it compares: times, solvers, sources of a made-up recording."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path

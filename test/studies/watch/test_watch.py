@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch as a function: the alarms of ``replay --watch``, as a result that shows and writes itself."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
