@@ -42,28 +42,6 @@ def test_two_simulated_links_as_json_and_csv(tmp_path: Path, capsys: pytest.Capt
     assert composed[0][0]['pose']['position'] == pytest.approx([1.2589, 0.0, 0.1745], abs=1e-2)
 
 
-@pytest.mark.parametrize(
-    ('argv', 'status', 'message'),
-    [
-        (['chain', EXAMPLE, '--json'], 2, '--out, --json and --count need --no-ros'),
-        (['chain', EXAMPLE, '--no-ros', '--out', 'x.txt'], 2, 'must end in .csv'),
-        (['chain', EXAMPLE, '--no-ros', '--out', 'gone/x.csv'], 4, 'there is no folder gone'),
-        (['chain', 'gone.yaml', '--no-ros'], 3, 'gone.yaml: no such chain file'),
-        (['compensator', '--urdf', URDF, '--tip', 'tol'], 3, 'tip: no link tol; did you mean tool?'),
-        (['compensator', '--tip', 'tool', '--axes', 'x,u'], 2, "--axes = ['x', 'u']: each must be one of"),
-        (['compensator', '--urdf', URDF], 3, 'tip: the link of the end effector must be named'),
-        (['compensator', '--drive'], 3, 'tip: the link of the end effector must be named'),
-        (['compensator', '--urdf', URDF, '--tip', 'tool', '--stale', 'nan'], 2, '--stale = nan s: must be finite'),
-        (['compensator', '--urdf', 'gone.urdf', '--tip', 'tool'], 3, 'gone.urdf: no such URDF file'),
-    ],
-)
-def test_rejected(argv: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(argv) == status
-    output = capsys.readouterr().err
-    assert message in output
-    assert output.count('\n') == 1
-
-
 RIG = str(CONFIG / 'thesis_rig.yaml')
 
 
@@ -84,30 +62,6 @@ def test_the_mode_comes_from_the_rig_file_or_the_options(tmp_path: Path) -> None
     assert chosen('--params-file', str(rig), '--modes', 'bending,torsion', '--shaper', 'ei') == both
     assert chosen('--frequency', '9', '--damping-ratio', '0', '--shaper', 'mzv') == shaper('mzv', 9.0, 0.0)
     assert chosen('--shaper', 'none').times == (0.0,)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('options', 'status', 'message'),
-    [
-        ([], 3, 'which mode: give params_file, or frequency and damping_ratio; or shaper: none'),
-        (['--shaper', 'zvx'], 2, "--shaper = 'zvx': must be one of zv, mzv, zvd, ei, recommended, none"),
-        (['--damping-ratio', '0.1'], 2, 'damping_ratio: must be given together with frequency'),
-        (['--frequency', '-9', '--damping-ratio', '0'], 2, '--frequency = -9.0 Hz: must be at least 0'),
-        (['--frequency', '0.01'], 2, '--frequency = 0.01 Hz: must be at least 0.1'),
-        (['--frequency', '9', '--params-file', RIG], 2, 'frequency and params_file: must not be given together'),
-        (['--params-file', RIG, '--modes', 'bending,bending'], 2, 'modes: none may be there twice'),
-        (['--params-file', RIG, '--modes', 'shear'], 2, 'each must be one of bending, torsion'),
-        (['--max-step', 'nan'], 2, '--max-step = nan rad or m: must be finite'),
-        (['--params-file', 'gone.yaml'], 3, 'gone.yaml: no such parameter file'),
-        (['--shaper', 'none', '--urdf', 'gone.urdf'], 3, 'gone.urdf: no such URDF file'),
-    ],
-)
-def test_shaper_rejects(options: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['shaper', *options]) == status
-    output = capsys.readouterr().err
-    assert message in output
-    assert output.count('\n') == 1
 
 
 @pytest.mark.slow

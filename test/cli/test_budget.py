@@ -63,35 +63,6 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
     assert json.loads(capsys.readouterr().out)['method'] == 'wls'
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ('arguments', 'status', 'message'),
-    [
-        (['budget', '--set', 'nothing'], 2, 'NAME=VALUE'),
-        (['budget', '--set', 'nothing=1'], 2, 'no such input'),
-        (['budget', '--monte-carlo', '1'], 2, '--monte-carlo'),
-        (['budget', '--monte-carlo', '1000', '--seed', '-1'], 2, '--seed'),
-        (['budget', '--load', 'nan', '0', '0'], 2, 'must be finite'),
-        (['budget', '--load', '0', '-500', '0'], 2, 'take a smaller load'),
-        (['budget', '--load', '1e300', '0', '0'], 2, 'than the link is long'),
-        (['budget', '--out', 'budget.txt'], 2, '.png, .svg or .pdf'),
-        (['budget', '--inputs', 'absent.yaml'], 3, 'absent.yaml'),
-        (['budget', '--params-file', 'absent.yaml'], 3, 'absent.yaml'),
-        (['design', '--params-file', RIG, '--sigma', '0'], 2, '--sigma'),
-        (['design', '--params-file', RIG, '--radius', '-1'], 2, '--radius'),
-        (['design', '--params-file', RIG, '--out', 'plan.txt'], 2, '.png, .svg or .pdf'),
-        (['design', '--params-file', RIG, '--out', 'no/such/folder/plan.png'], 4, 'cannot be written'),
-    ],
-)
-def test_bad_input_is_rejected_in_one_line(
-    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(arguments) == status
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count('\n') == 1
-
-
 def test_a_rigs_placement_is_compared(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['design', '--params-file', RIG, '--sigma', '2e-6']) == 0
     out = capsys.readouterr().out

@@ -63,39 +63,6 @@ def test_ros_arguments_go_through_untouched(monkeypatch: pytest.MonkeyPatch) -> 
     assert taken == [ros]
 
 
-def rejected(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
-    status = main(list(argv))
-    err = capsys.readouterr().err.strip()
-    assert err.count('\n') == 0, err
-    assert err.startswith(f'psd-deflection {argv[0]}: ')
-    return status, err
-
-
-def test_bad_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    block_size: 0\n')
-    status, err = rejected(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
-    assert status == 3
-    assert f'{rig}: block_size = 0 samples: must be at least 1' in err
-    rig.write_text('/**: [')
-    status, err = rejected(capsys, 'params', '--params-file', str(rig))
-    assert status == 3
-    assert f'{rig}:2:1: malformed YAML' in err
-
-
-@pytest.mark.parametrize(
-    ('argv', 'reported'),
-    [(['simulate'], '--out OUT (a recording) or --serve'), (['design', '--out', 'a.png'], 'give --params-file')],
-    ids=['simulate', 'design'],
-)
-def test_options_that_do_not_go_together_are_usage(
-    argv: list[str], reported: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, err = rejected(capsys, *argv)
-    assert status == 2
-    assert reported in err
-
-
 def test_params_lists_each_with_unit_and_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['params']) == 0
     out = capsys.readouterr().out

@@ -214,24 +214,3 @@ def test_losses_and_missing_estimates_are_marked() -> None:
         moved = dataclasses.replace(drawn, spots=later).table()
         breaks = np.setdiff1d(moved['t'][np.isnan(moved['lost'])], gone)
         assert breaks.tolist() == pytest.approx([150 * 0.02 - 0.01 + moved_ns / 2e9], abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'status', 'reported'),
-    [
-        (['no_such'], 4, 'no such recording'),
-        ([str(BAGS / 'clean'), '--from', '2', '--to', '1'], 2, '--from 2.0 --to 1.0: must rise'),
-        ([str(BAGS / 'clean'), '--from', 'mark:x'], 4, 'it has no marks'),
-        ([str(BAGS / 'clean'), '--from', '9'], 4, 'has no samples to draw between --from and --to'),
-        ([str(BAGS / 'clean'), '--out', 'x.bmp'], 2, 'the name must end in'),
-        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.html'], 4, 'cannot be written'),
-        ([str(BAGS / 'clean'), '--out', '/no/such/folder/x.png'], 4, 'cannot be written'),
-    ],
-)
-def test_an_undrawable_recording_gives_one_line(
-    arguments: list[str], status: int, reported: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(['plot', *arguments]) == status
-    err = capsys.readouterr().err
-    assert reported in err
-    assert err.strip().count('\n') == 0

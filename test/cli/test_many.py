@@ -112,26 +112,6 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
         assert frame[f'sd {name}'][0] == one['sd']
 
 
-@pytest.mark.parametrize(
-    ('words', 'message'),
-    [
-        (['discover', 'a', 'b', '--executor', 'processes', '--out', 'x'], 'needs --each'),
-        (['discover', 'a', '--out', 'x.parquet'], 'needs --each'),
-        (['discover', 'a', '--each', '--adopt', 'mine', '--out', 'x'], 'not with --each'),
-        (['calibrate', 'a', '--each', '--reference', 'b', '--out', 'x'], 'not with --each'),
-        (['calibrate', 'a', '--each', '--check', 'b'], 'is for itself'),
-        (['replay', 'a', 'b', '--out', 'x.csv'], 'go into one X.parquet'),
-        (['replay', 'a', '--executor', 'threads'], 'must be serial, processes'),
-        (['info', 'a', 'b', '--out', 'x.csv'], 'must end in .parquet'),
-    ],
-)
-def test_what_does_not_fit_is_rejected_before_the_work(
-    words: list[str], message: str, archive: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 2
-    assert message in capsys.readouterr().err
-
-
 def test_folders_are_those_of_the_archive(tmp_path: Path) -> None:
     names = ['/lab/a/run', '/lab/b/run', '/lab/b/run.csv']
     assert _fleet.folders_of(names, tmp_path) == {

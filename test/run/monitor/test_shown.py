@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.log import INFO
-from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
@@ -183,26 +182,6 @@ def test_a_recording_can_be_paused_and_sought() -> None:
         source.mark('x', 0.0)
     with pytest.raises(RejectedError, match='those that were recorded'):
         source.step()
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'status', 'reported'),
-    [
-        (['no_such_bag'], 4, 'no such recording'),
-        ([str(BAGS / 'clean'), '--speed', '0'], 2, '--speed 0: must be above 0'),
-        (['--speed', '0'], 2, '--speed 0: must be above 0'),
-        ([str(BAGS / 'clean'), '--port', '/dev/ttyACM0'], 2, '--port is for a rig'),
-        (['--http-port', '70000'], 2, 'monitor_port = 70000'),
-        ([str(BAGS / 'clean'), '--address', '192.0.2.1', '--http-port', '0'], 3, 'cannot be served there'),
-    ],
-)
-def test_what_cannot_be_is_one_line(
-    arguments: list[str], status: int, reported: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(['monitor', *arguments]) == status
-    err = capsys.readouterr().err
-    assert reported in err
-    assert err.strip().count('\n') == 0
 
 
 def test_a_row_has_the_block_and_its_primary_estimate() -> None:
