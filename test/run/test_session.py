@@ -3,6 +3,7 @@
 """What is asked of a session while its device is there, away, or silent."""
 
 import queue
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -48,8 +49,11 @@ class Running:
         assert estimates.enough.wait(WAIT_S)
 
     def heard(self, text: str) -> None:
-        while text not in self.logged.get(timeout=WAIT_S):
-            pass
+        """Wait for a line with ``text``; each has at most 160 characters, without its paths."""
+        line = ''
+        while text not in line:
+            line = self.logged.get(timeout=WAIT_S)
+            assert len(re.sub(r'/\S+', '', line)) <= 160, line
 
 
 @pytest.fixture
