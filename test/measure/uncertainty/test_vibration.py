@@ -86,6 +86,11 @@ def test_slow_motion_steps_and_regular_gaps_make_no_tone() -> None:
     assert not found((noise(1) + ramp)[here], noise(2)[here], here)
 
 
+def test_too_short_segments_have_no_tones() -> None:
+    assert ToneSearch(2, SEGMENT_BLOCKS).tones(ALL[:100], noise(1, n=100), noise(2, n=100), TURN) == ()
+    assert found(noise(1, n=1), noise(2, n=1), ALL[:1]) == ()
+
+
 def test_a_tone_with_gaps_is_no_smaller() -> None:
     here = np.sort(np.random.default_rng(3).choice(N, 800, replace=False))
     (one,) = found((noise(1) + 5e-6 * tone(87.0)[:, None])[here], noise(2)[here], here)
