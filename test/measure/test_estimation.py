@@ -221,6 +221,14 @@ def test_ambient_light_is_removed_with_sum_of_its_psd(psd: int) -> None:
         np.testing.assert_allclose(light.apply(dots, sums), wanted, rtol=1e-12)
 
 
+def test_samples_are_corrected_with_their_own_sums() -> None:
+    """Of 4 V, where the nominal sum is 5 V."""
+    light = {'name': 'ambient_light', 'psd': 1, 'level': 0.5, 'x': 1e-3, 'y': -2e-3}
+    rig = load_rig(overrides={f'effects.light.{name}': value for name, value in light.items()})
+    (spots,) = (r for r in Pipeline(rig).process(chunk(at_rest(1, 4.0))) if isinstance(r, SpotMeans))
+    assert spots.dots == pytest.approx((-0.5e-3 / 3.5, 1e-3 / 3.5, 0.0, 0.0))
+
+
 def test_what_came_last_is_taken_off_first() -> None:
     """A PSD is turned, then its axes mix, then it is scaled: three that do not commute."""
     c, s = np.cos(0.3), np.sin(0.3)

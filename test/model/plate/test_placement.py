@@ -66,9 +66,10 @@ def test_a_round_room_wants_its_sensors_opposite(room: Room, expected: float) ->
     assert condition_number(design_matrix(pair), 0.1).two == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_rim_has_candidates_all_around() -> None:
-    points = Room(0.100).candidates()
-    angles = np.sort(np.arctan2(*points[np.hypot(*points.T) > 0.0999999].T))
+@pytest.mark.parametrize('radius', [0.030, 0.100])
+def test_each_rim_has_candidates_all_around(radius: float) -> None:
+    points = Room(0.100, keep_out=0.030).candidates()
+    angles = np.sort(np.arctan2(*points[np.abs(np.hypot(*points.T) - radius) < 1e-9].T))
     assert np.diff(angles, append=angles[0] + 2.0 * math.pi) == pytest.approx(2.0 * math.pi / (8 * 24))
 
 
