@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.correction import Correction
 from psd_deflection.measure.estimation import Estimation
 from psd_deflection.measure.pipeline import Pipeline
@@ -72,11 +73,13 @@ def test_a_twist_that_is_taken_for_none_is_as_unsure_as_any() -> None:
     assert found.covariance[4] - found.covariance[0] == pytest.approx(0.1**2 * 0.02**2, rel=1e-9)
 
 
+BASE = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
+
+
 def test_zero_noise_of_base_psds_is_that_of_rig_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
     want = 5e-4**2 * (2e-3**2 + (10.0 / 2**15) ** 2 / 12.0) / 20.0
     # Of the others it is that of a block's mean, as it was measured.
-    for rig, noise in ((load_rig(overrides=base), want), (load_rig(), 20e-12)):
+    for rig, noise in ((load_rig(overrides=BASE), want), (load_rig(), 20e-12)):
         estimation = Estimation(rig, ())
         monkeypatch.setattr(estimation.estimator, 'mean_variances', lambda size: (size * 1e-12,) * 4)
         assert estimation.zero_noise(20) == pytest.approx((noise,) * 4, rel=1e-9, abs=0.0)
@@ -206,6 +209,14 @@ def test_without_a_temperature_and_a_time_nothing_has_drifted() -> None:
     # The beam of PSD 1 has gone so far, and the dot with it.
     got = late.apply(REST, t=np.array([0.0, 3.0]))
     np.testing.assert_allclose(got, [[0.0] * 4, [-6e-6, -3e-6, 0.0, 0.0]], rtol=1e-4, atol=1e-18)
+
+
+def test_a_beam_that_leans_is_corrected_on_the_plate_alone() -> None:
+    leans = {'beam_1.angle': [0.0, 1e-3]}
+    assert Correction.from_rig(load_rig(overrides=leans)).active
+    assert not Correction.from_rig(load_rig(overrides=BASE)).active
+    with pytest.raises(ConfigError, match=r'^beam_N\.angle: '):
+        Correction.from_rig(load_rig(overrides={**BASE, **leans}))
 
 
 @pytest.mark.parametrize('psd', [1, 2])
