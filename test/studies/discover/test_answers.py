@@ -26,6 +26,7 @@ from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece,
 from psd_deflection.studies.discover.hidden import beginning, mistakes, only_in
 from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.planning import Discrimination, Plan, Suggestion
+from psd_deflection.studies.discover.recorded import Recorded, compared, snapped
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut
@@ -178,6 +179,10 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     for shift in (2, -2, 1, -1):
         late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
         assert min(abs(delay - shift / 1000.0) for delay in likely_delays(late)) < 0.0025
+    # The last loads of a recording may be noted after its end: it is compared without them.
+    for shift, excluded in ((40, 45), (-1, 0)):
+        late = compared(Recorded((dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0)),), RIG, ()))[1]
+        assert np.isnan(late.observations[0].volts[:, 0]).sum() == excluded
     # The link follows its loads as simulated: nothing is late.
     assert likely_delays(Workspace([o])) == []
     short = Workspace([make_observation()])
@@ -311,19 +316,27 @@ def test_lines_come_strongest_first_each_once() -> None:
         assert proposals.persistent([50.0], [rows_of[:3072]], [np.ones(6)], [1e-3]) == [50.0]
 
 
-@pytest.mark.parametrize(('counts', 'observed'), [(1, False), (2, False), (3, True), (40, True)])
-def test_a_step_is_coarse_from_three_counts_on(counts: int, observed: bool) -> None:
+@pytest.mark.parametrize(('counts', 'observed'), [(1, False), (2, False), (3, True), (10.3, True), (40, True)])
+def test_a_step_is_coarse_from_three_counts_on(counts: float, observed: bool) -> None:
     """All readings are whole multiples of it; its deviation is that of rounding to counts, 1/sqrt(12)."""
     lsb = RIG.converter.volts_per_count
     rng = np.random.default_rng(2)
     k = np.rint(rng.uniform(-300, 300, (2000, 6)))
-    o = dataclasses.replace(make_observation(), volts=k * counts * lsb, loads=np.zeros((2000, 3)), temperature=None)
+    volts = np.rint(k * counts) * lsb
+    o = dataclasses.replace(make_observation(), volts=volts, loads=np.zeros((2000, 3)), temperature=None)
     found = proposals.coarse_step(o)
     assert (found is not None) == observed
     if found is not None:
         values = np.unique(k)
-        assert found[0] == pytest.approx(counts * lsb, rel=1e-9)
+        assert found[0] == pytest.approx(float(values @ np.rint(values * counts) / (values @ values)) * lsb, rel=1e-9)
         assert found[1] == pytest.approx(lsb / math.sqrt(12.0 * float(values @ values)), rel=1e-9)
+        # The readings are put on it; if the rig file states steps, it is no news.
+        for known in ((), (make_active('quantisation', {'step': 0.5}, 'test'),)):
+            ready = snapped(Recorded((o,), RIG, known))
+            assert (ready.stated, ready.known, ready.value_grid_stated) == (known, (), bool(known))
+            assert ready.value_grid is not None
+            assert ready.value_grid.values['step'] == (0.5 if known else found[0])
+            np.testing.assert_allclose(ready.observations[0].volts, k * found[0], rtol=1e-9)
     # Readings between the steps, and there are none; few values prove nothing.
     off = o.volts.copy()
     off[::50] += 0.31 * counts * lsb

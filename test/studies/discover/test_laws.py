@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -24,10 +24,10 @@ from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_te
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.discover.conclusion import RigConclusion
 from psd_deflection.studies.discover.laws import find_jitter, find_law
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
@@ -108,15 +108,20 @@ def test_noise_beside_a_movement_is_no_law() -> None:
         assert find_jitter(ws, dataclasses.replace(null, difference=difference), penalty) is None
 
 
-def test_law_with_large_held_out_gap_is_not_written() -> None:
+def test_law_with_large_held_out_gap_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
     ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
     null = refit(ws, ())
     found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
     assert found is not None
+    nothing: dict[str, Any] = dict.fromkeys(f.name for f in dataclasses.fields(Discovery))
+    without = Discovery(**{**nothing, 'gap_floor': ws.floor(), 'adopted': ''})
+    assert without.adopt('none') is without
     for floors, written in ((1.9, True), (2.1, False)):
-        law = dataclasses.replace(found, heldout_gap=floors * ws.floor())
-        concluded = SimpleNamespace(law=law, gap_floor=ws.floor(), adopted='')
-        assert (RigConclusion.model_of_law.fget(concluded) is not None) == written  # type: ignore[attr-defined]
+        concluded = dataclasses.replace(without, law=dataclasses.replace(found, heldout_gap=floors * ws.floor()))
+        assert (concluded.model_of_law is not None) == written
+        assert concluded.adopt(name := f'odd{written}').adopted == name
+        assert (tmp_path / f'{name}.yaml').exists() == written
 
 
 STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))

@@ -179,11 +179,17 @@ def test_mixed_tables_and_recordings_are_rejected(tmp_path: Path) -> None:
     (tmp_path / 'list.yaml').write_text('- recording: hung.csv\n  overrides: {link.length: -1.0}\n')
     with pytest.raises(ConfigError, match=r'list\.yaml: entry 1: link.length = -1'):
         read_tables([tmp_path / 'list.yaml'])
+    assert is_table(table)
+    assert not is_table(tmp_path / 'none.csv')
+    assert not is_table(tmp_path / 'run.csv')
+
+
+def test_tables_of_one_search_are_of_one_kind_and_as_many_psds() -> None:
+    three = replace_values(RIG, {'psd_3.center': [0.08, -0.06]})
     with pytest.raises(RecordingError, match='one has x1,y1,x2,y2 and dx,dy,theta: search them one by one'):
         ReadingsPlant([read([]), Readings('b', RIG, 'estimates', LOADS, np.zeros((len(LOADS), 3)))])
-    assert is_table(table)
-    assert not is_table(tmp_path / 'run.csv')
-    assert not is_table(tmp_path / 'none.csv')
+    with pytest.raises(RecordingError, match='b: is of 3 PSDs, table of 2: search them one by one'):
+        ReadingsPlant([read([]), Readings('b', three, 'dots', LOADS, np.zeros((len(LOADS), 6)))])
 
 
 @pytest.mark.slow

@@ -186,6 +186,17 @@ def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) ->
         assert left < 0.9 * of
 
 
+@pytest.mark.parametrize('gain', [900.0, 9e4])
+@pytest.mark.parametrize(('share', 'tried'), [(0.57, []), (0.63, [['b']])])
+def test_what_explains_six_tenths_is_tried_instead(gain: float, share: float, tried: list[list[str]]) -> None:
+    shown = pictures(A, B)
+    shown[B] = math.sqrt(share) * shown[A] + math.sqrt(1.0 - share) * across(shown[B], shown[A])
+    plant = Plant(shown, without_noise((shown[A], gain)) + noise())
+    null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
+    found = searching(plant, shown, 'ab').alternatives(null, fit, 0, null.chi2 - fit.chi2)
+    assert [named(f) for f in found] == tried
+
+
 def test_a_small_share_counts_beside_many_effects() -> None:
     names = 'abcdefghijkl'
     sizes = [9e5, 3e5, 1e5, 4e4, *[3000.0] * 8]
@@ -406,6 +417,15 @@ def test_a_size_leaves_its_bound_for_however_little_it_gains(least: float, most:
         want = sign * 0.5 * SIGMA / np.linalg.norm(shown[A]) if inside > 0.0 else 0.0
         assert fit.effects[0].values['x'] == pytest.approx(want, rel=1e-3, abs=1e-12)
         assert fit.at_bound == (() if inside > 0.0 else ((0, 'x'),))
+
+
+@pytest.mark.parametrize(('length', 'size'), [(0.49, 0.0), (0.51, 0.25), (0.0, 0.3)])
+def test_a_size_that_nothing_determines_is_off(length: float, size: float) -> None:
+    """Over its whole range, 2, it moves the residual by less than a deviation; of nothing it stays where it began."""
+    shown = pictures(A)
+    shown[A] *= length * SIGMA / np.linalg.norm(shown[A])
+    fit = refit(Plant(shown, 0.25 * shown[A]), [active('a', x=0.3)])
+    assert fit.effects[0].values['x'] == pytest.approx(size, abs=1e-4)
 
 
 def test_recording_of_few_samples_is_excluded_alone() -> None:
