@@ -108,9 +108,17 @@ def test_one_mode_is_split_into_two(apart: float) -> None:
 
 
 def test_at_most_thirty_windows_are_tried() -> None:
+    """Half a window apart; a quiet one is not, nor one of which a fifth is lost."""
     t = times(9000)
     samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * t)
-    assert len(seed_windows(samples, samples, RATE, [(16.0, 0.01)], 1e-6, 100, 50)) == 30
+    firsts = sorted(s.first for s in seed_windows(samples, samples, RATE, [(16.0, 0.01)], 1e-6, 100, 25))
+    assert len(firsts) == 30
+    assert np.diff(firsts).min() >= 50
+    samples[2000:] = 0.0
+    lost = samples.copy()
+    lost[:1000:4] = math.nan
+    firsts = sorted(s.first for s in seed_windows(lost, samples, RATE, [(16.0, 0.01)], 1e-6, 100, 25))
+    assert 915 <= firsts[0] <= firsts[-1] < 2000
 
 
 def test_two_modes_come_apart_while_a_stretch_grows() -> None:
@@ -130,6 +138,23 @@ def blows(n: int, firsts: Sequence[int], noise: float = 1e-6) -> FloatArray:
     for first, end in zip(firsts, [*firsts[1:], n], strict=True):
         samples[first:end] += ring(times(end - first))
     return samples
+
+
+def test_a_stretch_grows_forward_and_then_back() -> None:
+    """By half a window or a third of itself, to less than that from the blows before and after it."""
+    samples = blows(3500, [650, 2000])
+    seed = Stretch(samples, 1100, 1484, RATE)
+    grown, fit = grow_stretch(samples, seed, fit_modes([seed], [(16.0, 0.01)]), 384, 1e-6)
+    assert (grown.first, grown.last) == (1100 - 256, 1484 + 2 * 192)
+    np.testing.assert_allclose(fit.modes, [(16.0, 0.02)], rtol=2e-3)
+
+
+@pytest.mark.parametrize(('share', 'fits'), [(0.97, 1), (1.03, 0)])
+def test_a_window_may_be_left_a_share_of_its_middle(share: float, fits: int) -> None:
+    """Of the swing after three of its six periods, however quiet the noise."""
+    rest = share * module.SHARE * 1e-3 * math.exp(-0.02 * 2.0 * math.pi * 3.0)
+    samples = ring(times(385)) + rest * np.resize([1.0, -1.0], 385)
+    assert len(scan_windows(samples, RATE, [(16.0, 0.02)], 1e-9, 384, 32)) == fits
 
 
 def test_stretches_begin_after_a_blow_and_end_before_the_next() -> None:

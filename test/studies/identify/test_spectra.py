@@ -157,8 +157,7 @@ def lines(samples: FloatArray, frequency: float) -> tuple[FloatArray, FloatArray
     return f[about], p[about]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(('prior', 'guess'), [(None, 14.0), (0.2, 14.5)])
+@pytest.mark.parametrize(('prior', 'guess'), [pytest.param(None, 14.0, marks=pytest.mark.slow), (0.2, 14.5)])
 def test_mode_is_likeliest_with_scatter_of_likelihood(
     prior: float | None, guess: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
