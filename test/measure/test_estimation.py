@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.correction import Correction
+from psd_deflection.measure.correction import Correction, Surroundings
 from psd_deflection.measure.estimation import Estimation
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.misalignment.model import INDEX
-from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, RawChunk, SpotMeans
+from psd_deflection.records import ENVIRONMENT, BlockStatus, DeflectionEstimate, FloatArray, RawChunk, SpotMeans
 from psd_deflection.rig.config import load_rig
 
 
@@ -199,6 +199,10 @@ def correction(*effects: dict[str, object]) -> Correction:
 
 
 def test_without_a_temperature_and_a_time_nothing_has_drifted() -> None:
+    around = Surroundings()
+    assert around.warmer == 0.0
+    around.load_state_dict(dict(zip(ENVIRONMENT, (0.0, 20.0, 21.5), strict=True)))
+    assert around.warmer == 1.5
     warm = correction({'name': 'thermal_drift', 'psd': 2, 'x': 3e-6, 'y': -1e-6})
     assert (warm.uses_temperature, warm.uses_time) == (True, False)
     np.testing.assert_array_equal(warm.apply(REST), REST)
