@@ -103,6 +103,15 @@ def test_other_light_may_come_from_anywhere_on_the_active_area() -> None:
     np.testing.assert_allclose(bright, dark * (1.0 + (share * length / 2.0) ** 2 / 3.0 / own), rtol=1e-6, atol=1e-20)
 
 
+def test_a_finding_that_says_nothing_of_light_leaves_the_covariance() -> None:
+    """Sums above their limit, and not above what is nominal; in the second block of one PSD alone."""
+    volts = at_rest(2)
+    volts[20:, :3] = 0.0
+    quiet, found = (estimates(volts, {'sum_max': most, 'degraded': 'zero'}) for most in (8.0, 4.5))
+    assert [e.solver for e in found] == ['exact', 'one_psd']
+    assert found == quiet
+
+
 def calibrated(**sds: float) -> dict[str, object]:
     """A calibration that left these standard deviations; a name with ``__`` for the dot."""
     left = {name.replace('__', '.'): sd for name, sd in sds.items()}
