@@ -23,20 +23,19 @@ from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
-    RawChunk,
     Record,
     SampleBlock,
-    SpotMeans,
     TipLoad,
     channel_names,
 )
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run.session_texts import zero_text
+from test.streams import COUNT, chunk
+from test.streams import spots as spots_of
 
 Counts = npt.NDArray[np.int32]
 Spoil = Callable[[Counts], None]
 
-STEP = 10.0 / 32768
 THREE = Path(__file__).parents[1] / 'config' / 'three_psds.yaml'
 LEVEL = {'psd_1.height': 0.0, 'psd_2.height': 0.0}
 FOURTH = {'psd_4.center': [-0.06, -0.06], 'psd_4.height': -0.04}
@@ -51,17 +50,8 @@ def with_solver(rig: Rig, solver: str, **more: object) -> Rig:
     return replace_values(rig, {'solver': solver, 'solvers': [solver], **more})
 
 
-def chunk_of(counts: Counts, first: int = 0) -> RawChunk:
-    seq = np.arange(first, first + len(counts))
-    return RawChunk(seq, seq * 1_000_000, counts, np.zeros(len(counts), np.uint8), STEP)
-
-
 def primaries(records: Sequence[Record]) -> list[DeflectionEstimate]:
     return [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
-
-
-def spots_of(records: Sequence[Record]) -> list[SpotMeans]:
-    return [r for r in records if isinstance(r, SpotMeans)]
 
 
 def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
@@ -70,7 +60,7 @@ def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
     for i in range(len(rig.psds)):
         volts[3 * i : 3 * i + 2] = dots[2 * i : 2 * i + 2] / 5e-4
     noisy = volts + np.random.default_rng(seed).normal(0.0, 2e-3, (n, len(volts)))
-    return np.rint(noisy / STEP).astype(np.int32)
+    return np.rint(noisy / COUNT).astype(np.int32)
 
 
 @pytest.mark.slow
@@ -160,7 +150,7 @@ def run(rig: Rig, spoil: Spoil | None = None) -> tuple[list[Record], FloatArray,
     if spoil is not None:
         spoil(counts)
     pipeline = Pipeline(rig)
-    records = list(pipeline.process(chunk_of(counts)))
+    records = list(pipeline.process(chunk(counts)))
     middle = np.arange(9, len(counts), 20)
     p = simulated.pose
     return records, (9.0 * (p[middle] + p[middle + 1]) - p[middle - 1] - p[middle + 2]) / 16.0, pipeline
@@ -239,9 +229,9 @@ def test_frozen_psd_is_not_the_psd_that_contradicts(three: Rig) -> None:
     """At rest PSD 1 is 1 mm off; PSD 3 does not move by a bit, as a quiet one may."""
     rig = with_solver(three, 'exact', **LEVEL)
     counts = at_rest(rig, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]), 200, 1)
-    counts[:, 6:] = np.rint(np.array([0.0, 0.0, 5.0]) / STEP)
+    counts[:, 6:] = np.rint(np.array([0.0, 0.0, 5.0]) / COUNT)
     pipeline = Pipeline(rig)
-    spots = spots_of(list(pipeline.process(chunk_of(counts))))
+    spots = spots_of(list(pipeline.process(chunk(counts))))
     assert {s.excluded for s in spots} == {(1,)}
     assert (pipeline.counters.estimates, pipeline.counters.degraded) == (10, 10)
     assert pipeline.counters.findings['psd_3 stands still'] == 6
@@ -257,7 +247,7 @@ def test_of_two_outlier_candidates_the_frozen_one_is_excluded(three: Rig, still:
     counts = at_rest(rig, dots, 200, 1)
     counts[:, 3 * still : 3 * still + 3] = counts[0, 3 * still : 3 * still + 3]
     pipeline = Pipeline(rig)
-    excluded = [s.excluded for s in spots_of(list(pipeline.process(chunk_of(counts))))]
+    excluded = [s.excluded for s in spots_of(list(pipeline.process(chunk(counts))))]
     assert excluded == [()] * 4 + [(still + 1,)] * 6
     assert pipeline.counters.findings[f'psd_{still + 1} contradicts the others and is left out'] == 6
 
@@ -297,7 +287,7 @@ def test_each_of_three_may_be_the_last(three: Rig, psd: int) -> None:
     counts = at_rest(rig, np.tile([-1e-3, 2e-3], 3), 20, 1)
     for other in {0, 1, 2} - {psd}:
         counts[:, 3 * other : 3 * other + 3] = 0
-    (found,) = primaries(list(Pipeline(rig).process(chunk_of(counts))))
+    (found,) = primaries(list(Pipeline(rig).process(chunk(counts))))
     assert found.solver == 'one_psd'
     assert found.pose == pytest.approx((1e-3, -2e-3, 0.0), abs=2e-6)
 
@@ -326,8 +316,8 @@ def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solv
     for psd in range(3):
         volts[:, 3 * psd : 3 * psd + 2] = dots[:, 2 * psd : 2 * psd + 2] / 5e-4
     noisy = volts + np.random.default_rng(0).normal(0.0, 2e-3, volts.shape)
-    counts = np.rint(noisy / STEP).astype(np.int32)
-    found = primaries(list(Pipeline(with_solver(three, solver)).process(chunk_of(counts))))[200:]
+    counts = np.rint(noisy / COUNT).astype(np.int32)
+    found = primaries(list(Pipeline(with_solver(three, solver)).process(chunk(counts))))[200:]
     off = np.abs([e.pose for e in found]) / np.sqrt([e.variances for e in found])
     assert off.max() < 7.0
     assert (off < 1.96).mean(axis=0).min() > 0.93
@@ -378,7 +368,7 @@ def test_a_bag_whose_number_of_psds_changes_is_rejected(tmp_path: Path, three: R
         counts = RigSimulator(rig).step(np.zeros((20, 3))).counts
         seq = np.arange(20) + 20 * index
         flags = np.zeros(20, np.uint8)
-        blocks.append(SampleBlock(index, seq, seq * 1_000_000 + 1, (counts * STEP).astype(np.float32), flags))
+        blocks.append(SampleBlock(index, seq, seq * 1_000_000 + 1, (counts * COUNT).astype(np.float32), flags))
     with contextlib.closing(open_sink(tmp_path / 'a.mcap', three.flat())) as sink:
         for block in blocks:
             sink.put(block)
@@ -400,13 +390,13 @@ def test_a_zero_is_of_all_psds(three: Rig) -> None:
     zeros = {'psd_1.zero': [1e-4, -1e-4], 'psd_2.zero': [0.0, 2e-4], 'psd_3.zero': [-3e-4, 1e-4]}
     counts = RigSimulator(replace_values(three, zeros), 2).step(np.zeros((600, 3))).counts
     pipeline = Pipeline(three)
-    list(pipeline.process(chunk_of(counts)))
+    list(pipeline.process(chunk(counts)))
     taken = pipeline.zero()
     assert taken is not None
     found = dict(taken.values)
     for name, wanted in zeros.items():
         assert found[name] == pytest.approx(wanted, abs=1e-6)
-    assert [e.pose for e in primaries(list(pipeline.process(chunk_of(counts, 600))))][-1] == pytest.approx(
+    assert [e.pose for e in primaries(list(pipeline.process(chunk(counts, 600))))][-1] == pytest.approx(
         (0.0, 0.0, 0.0), abs=5e-6
     )
 

@@ -94,6 +94,12 @@ REJECTED: list[tuple[list[str], int, str]] = [
     (['replay', CLEAN, '--out', ''], 2, '--out is empty'),
     (['replay', CLEAN, '--params-file='], 2, '--params-file is empty'),
     (['estimator', '--record', ''], 2, '--record is empty'),
+    (['load', 'nan', '0', '0'], 2, 'must be finite'),
+    (['load', '0', 'inf', '0'], 2, 'must be finite'),
+    *(
+        (['zero', '--url', url], 2, f'--url = {url}: is no address')
+        for url in ('ftp://rig/', 'http://', 'http://rig:99999/', 'http://[::1/')
+    ),
     (['discover', 'a', 'b', '--executor', 'processes', '--out', 'x'], 2, 'needs --each'),
     (['discover', 'a', '--out', 'x.parquet'], 2, 'needs --each'),
     (['discover', 'a', '--each', '--adopt', 'mine', '--out', 'x'], 2, 'not with --each'),

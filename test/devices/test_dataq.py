@@ -223,19 +223,6 @@ def test_another_rate_than_was_set_is_rejected(wired: Any, unloaded: Any) -> Non
         source.open(2.0)
 
 
-def test_an_unplugged_device_is_configured_again(wired: Any, run: Any, unloaded: Any) -> None:
-    port = wired(SimulatedDataq(unloaded(load_rig())))
-    running = run(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
-    running.take(40)
-    port.unplug()
-    running.heard('waiting for it to come back')
-    port.plug(SimulatedDataq(unloaded(load_rig())))
-    running.heard('the device is back')
-    running.forget()
-    running.take(40)
-    assert running.acquisition.counters.disconnects == 1
-
-
 def test_a_silent_device_is_configured_again(wired: Any, run: Any, unloaded: Any) -> None:
     device = SimulatedDataq(unloaded(load_rig()))
     running = run(load_rig(overrides={'source': 'dataq', 'port': str(wired(device).link)}))

@@ -26,7 +26,7 @@ from psd_deflection.devices.protocol.frames import (
 )
 from psd_deflection.devices.protocol.text_lines import Description, Line, parse
 from psd_deflection.devices.registry import DEVICES
-from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
+from psd_deflection.records import DeflectionEstimate, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
@@ -114,20 +114,11 @@ def port() -> Iterator[str]:
     process.stdout.close()
 
 
-class Kept:
-    def __init__(self) -> None:
-        self.records: list[Record] = []
-
-    def put(self, record: Record) -> None:
-        self.records.append(record)
-
-
 def test_it_works_unchanged_with_the_daemon(port: str) -> None:
     logged: list[str] = []
     session = Session(load_rig(overrides={'port': port}), texts(logged.append))
-    kept = Kept()
     estimates = Estimates(40)
-    session.processing.sinks += [kept, estimates]
+    session.processing.sinks.append(estimates)
     hello = session.acquisition.hello
     assert hello is not None
     assert hello.info['serial'] == 'SECOND-7'
@@ -141,9 +132,9 @@ def test_it_works_unchanged_with_the_daemon(port: str) -> None:
     assert (counters.bad, counters.repeated, counters.restarts) == (0, 0, 0)
     # On a busy machine the emulator may have to drop; it then says so.
     assert counters.lost == 0 or counters.device_dropped > 0
-    blocks = [r for r in kept.records if isinstance(r, SampleBlock)]
+    blocks = [r for r in estimates.records if isinstance(r, SampleBlock)]
     numbers = [int(s) for b in blocks for s in b.seq]
     assert numbers == sorted(set(numbers))
     ramp = [round(v * 32768 / 10) for b in blocks for v in b.volts[:, 0].tolist()]
     assert ramp == [(s - (2**32 - 500)) % 2**32 % 2000 for s in numbers]
-    assert any(isinstance(r, DeflectionEstimate) for r in kept.records)
+    assert any(isinstance(r, DeflectionEstimate) for r in estimates.records)

@@ -3,6 +3,7 @@
 """Lines of text: written by hand, and the simulated device on a pseudo-terminal."""
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.devices import PowerUp
+from psd_deflection.devices import LineDevice, PowerUp
+from psd_deflection.devices.dataq import SimulatedDataq
 from psd_deflection.devices.protocol.frames import BadFrame
 from psd_deflection.devices.protocol.text_lines import Description, Line, LineDecoder, TimeExtender, parse, with_check
 from psd_deflection.devices.registry import make_source
+from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.source import Sample
 from psd_deflection.devices.text_lines import SimulatedLines
 from psd_deflection.records import FLAG_OVER_RANGE, channel_names
@@ -198,13 +201,16 @@ def test_it_reads_the_rig(wired: Any, run: Any, unloaded: Any, volts: Any) -> No
     assert (counters.lost, counters.bad, counters.restarts) == (0, 0, 0)
 
 
-def test_an_unplugged_one_comes_back(wired: Any, run: Any, unloaded: Any) -> None:
-    port = wired(SimulatedLines(unloaded(load_rig())))
-    running = run(load_rig(overrides={'source': 'lines', 'port': str(port.link)}))
+@pytest.mark.parametrize(('source', 'made'), [('lines', SimulatedLines), ('dataq', SimulatedDataq)])
+def test_an_unplugged_device_is_asked_and_read_again(
+    wired: Any, run: Any, unloaded: Any, source: str, made: Callable[[RigFeed], LineDevice]
+) -> None:
+    port = wired(made(unloaded(load_rig())))
+    running = run(load_rig(overrides={'source': source, 'port': str(port.link)}))
     running.take(40)
     port.unplug()
     running.heard('waiting for it to come back')
-    port.plug(SimulatedLines(unloaded(load_rig())))
+    port.plug(made(unloaded(load_rig())))
     running.heard('the device is back')
     running.forget()
     running.take(40)
@@ -244,44 +250,6 @@ def test_another_device_is_rejected_by_name(wired: Any, text: bytes, message: st
         make_source(load_rig(overrides={'source': 'lines', 'port': str(port.link)})).open(2.0)
 
 
-def test_counts_of_24_bits(wired: Any) -> None:
-    device = Sends(b'\n#{"sample_rate_hz": 1000, "volts_per_count": %r}\n' % (10.0 / 2**23))
-    device.take = lambda since_power_up_ns, room=4096: b'1,1000,8388607,-8388608,4000000,0,1,5\n'  # type: ignore[method-assign]
-    rig = load_rig(overrides={'source': 'lines', 'port': str(wired(device).link), 'converter.bits': 24})
-    source = make_source(rig)
-    source.open(2.0)
-    source.start()
-    events = [event for _ in range(10) for event in source.read(1.0).events]
-    source.close()
-    assert events[0] == Sample(FLAG_OVER_RANGE, 1, 1000, (8388607, -8388608, 4000000, 0, 1, 5))
-
-
-@pytest.mark.parametrize(
-    ('info', 'line', 'reason'),
-    [
-        (b'"volts_per_count": 0.001', b'1,1000,0,0,40000,0,0,5', 'counts are whole numbers of 16 bits'),
-        (b'"volts_per_count": 0.001', b'1,1000,0,0,0.5,0,0,5', 'counts are whole numbers of 16 bits'),
-        (b'"serial": "a"', b'1,1000,0,0,123456,0,0,5', 'a reading is out of all bounds'),
-    ],
-)
-def test_readings_out_of_bounds_are_no_samples(wired: Any, info: bytes, line: bytes, reason: str) -> None:
-    device = Sends(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
-    device.take = lambda since_power_up_ns, room=4096: line + b'\n'  # type: ignore[method-assign]
-    source = make_source(load_rig(overrides={'source': 'lines', 'port': str(wired(device).link)}))
-    source.open(2.0)
-    source.start()
-    events = [event for _ in range(10) for event in source.read(1.0).events]
-    source.close()
-    assert events
-    assert all(isinstance(event, BadFrame) and event.reason == reason for event in events)
-
-
-def test_a_thousand_volts_are_the_most(wired: Any) -> None:
-    for line, reading in ((b'1,1000,0,0,1000,0,-1000,5', 1000.0), (b'1,1000,0,0,1000.1,0,0,5', None)):
-        _, event = sent(wired, b'"serial": "a"', line)
-        assert (event.readings[2] if isinstance(event, Sample) else None) == reading
-
-
 def sent(wired: Any, info: bytes, line: bytes, **more: Any) -> Any:
     """What the source makes of a line."""
     device = Sends(b'\n#{"sample_rate_hz": 1000, %s}\n' % info)
@@ -294,7 +262,35 @@ def sent(wired: Any, info: bytes, line: bytes, **more: Any) -> Any:
     return hello, events[0]
 
 
+def test_counts_of_24_bits(wired: Any) -> None:
+    info = b'"volts_per_count": %r' % (10.0 / 2**23)
+    _, event = sent(wired, info, b'1,1000,8388607,-8388608,4000000,0,1,5', **{'converter.bits': 24})
+    assert event == Sample(FLAG_OVER_RANGE, 1, 1000, (8388607, -8388608, 4000000, 0, 1, 5))
+
+
 ELECTRODES = b'1,1000,3,1,2,2,1,3,1,1'
+
+
+@pytest.mark.parametrize(
+    ('info', 'line', 'reason'),
+    [
+        (b'"volts_per_count": 0.001', b'1,1000,0,0,40000,0,0,5', 'counts are whole numbers of 16 bits'),
+        (b'"volts_per_count": 0.001', b'1,1000,0,0,0.5,0,0,5', 'counts are whole numbers of 16 bits'),
+        (b'"serial": "a"', b'1,1000,0,0,123456,0,0,5', 'a reading is out of all bounds'),
+        (b'"serial": "a"', ELECTRODES, '8 readings where the description says 6'),
+        (b'"electrodes": true', b'1,1000,0,0,5,0,0,5', '6 readings where the description says 8'),
+    ],
+)
+def test_readings_that_do_not_fit_are_no_samples(wired: Any, info: bytes, line: bytes, reason: str) -> None:
+    _, event = sent(wired, info, line)
+    assert isinstance(event, BadFrame)
+    assert event.reason == reason
+
+
+def test_a_thousand_volts_are_the_most(wired: Any) -> None:
+    for line, reading in ((b'1,1000,0,0,1000,0,-1000,5', 1000.0), (b'1,1000,0,0,1000.1,0,0,5', None)):
+        _, event = sent(wired, b'"serial": "a"', line)
+        assert (event.readings[2] if isinstance(event, Sample) else None) == reading
 
 
 def test_electrodes_become_the_readings_of_a_divider(wired: Any) -> None:
@@ -310,14 +306,6 @@ def test_electrode_counts_are_scaled_with_over_range(wired: Any) -> None:
     _, event = sent(wired, info, b'1,1000,32767,0,100,100,100,300,200,200')
     assert event.flags == FLAG_OVER_RANGE
     np.testing.assert_allclose(event[3], [10.0, 0.0, 32967 / 2 * scale, -5.0, 0.0, 400 * scale])
-
-
-@pytest.mark.parametrize(
-    ('info', 'line'), [(b'"serial": "a"', ELECTRODES), (b'"electrodes": true', b'1,1000,0,0,5,0,0,5')]
-)
-def test_wrong_number_of_readings_is_rejected(wired: Any, info: bytes, line: bytes) -> None:
-    _, event = sent(wired, info, line)
-    assert 'readings where the description says' in event.reason
 
 
 def test_three_psds(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:

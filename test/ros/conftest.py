@@ -18,7 +18,13 @@ import pytest
 from test.run.conftest import ScriptedDevice
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
-rclpy = pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
+pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 
 WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
 WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
@@ -156,6 +162,16 @@ class Peer:
 
         self.until(answered, f'the answer of {name}')
         return next(future for _, future in asked if future.done()).result()
+
+    def change(self, node: str, transition: int) -> bool:
+        """Whether a transition of the node succeeded."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self.call(ChangeState, f'{node}/change_state', request).success)
+
+    def set(self, node: str, name: str, value: object) -> Any:
+        """What the node answers when a parameter is set."""
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return self.call(SetParameters, f'{node}/set_parameters', request).results[0]
 
     def close(self) -> None:
         self.executor.shutdown()

@@ -19,9 +19,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
@@ -61,6 +58,16 @@ def compensator(domain: int) -> Iterator[Program]:
     yield one
     one.end()
     print(*one.lines[-50:], sep='\n')
+
+
+def following(peer: Any, share: float = 0.05) -> Plant:
+    """An arm whose offsets have come to follow its deflection, to this share of it."""
+    plant = Plant(peer.node)
+    peer.until(lambda: plant.error() > 2e-3, 'a deflection')
+    free = plant.error()
+    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
+    peer.until(lambda: plant.error() < share * free, 'offsets that follow')
+    return plant
 
 
 def longest_rest(plant: Plant, since: int) -> int:
@@ -109,60 +116,38 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
 
 @pytest.mark.slow
 def test_a_transition_lets_the_offsets_go_back_to_zero(compensator: Program, peer: Any) -> None:
-    plant = Plant(peer.node)
-    peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-    free = plant.error()
-    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-    peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
+    plant = following(peer)
     # So slowly that what was heard before it is stale by then.
     seconds = 1.5
-    assert changed(peer, 'max_rate', np.abs(plant.offsets[-1]).max() / seconds).successful
+    assert peer.set('/compensator', 'max_rate', np.abs(plant.offsets[-1]).max() / seconds).successful
     for wanted in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
-        assert changed_state(peer, wanted)
+        assert peer.change('/compensator', wanted)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
     assert plant.step() <= WITHIN
-
-
-def changed(peer: Any, name: str, value: float) -> Any:
-    """What the node answers when a parameter of a number is set."""
-    new = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-    request = SetParameters.Request(parameters=[Parameter(name=name, value=new)])
-    return peer.call(SetParameters, '/compensator/set_parameters', request).results[0]
-
-
-def changed_state(peer: Any, wanted: int) -> bool:
-    """Whether the transition succeeded."""
-    change = ChangeState.Request(transition=Transition(id=wanted))
-    return bool(peer.call(ChangeState, '/compensator/change_state', change).success)
 
 
 @pytest.mark.slow
 def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Program, peer: Any) -> None:
     """Offsets that take too long to go back, and a controller that does not tell what it has."""
-    plant = Plant(peer.node)
-    peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-    free = plant.error()
-    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-    peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
-
+    plant = following(peer)
     # This process may be silent for longer than that on a busy machine, and is no controller that tells nothing.
-    assert changed(peer, 'stale', 10.0).successful
-    assert changed(peer, 'max_rate', 1e-4).successful
+    assert peer.set('/compensator', 'stale', 10.0).successful
+    assert peer.set('/compensator', 'max_rate', 1e-4).successful
     asked = len(plant.offsets)
-    assert not changed_state(peer, Transition.TRANSITION_DEACTIVATE)
+    assert not peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
     left = re.compile(r'an offset of \S+ at \w+ is left after 10 s')
     peer.until(lambda: left.search(compensator.text) is not None, 'what is left')
     # It goes on meanwhile, and the next attempt waits anew.
     assert 0.0 < np.abs(plant.offsets[-1]).max() < np.abs(plant.offsets[asked]).max()
-    assert changed(peer, 'max_rate', 0.1).successful
-    assert changed_state(peer, Transition.TRANSITION_DEACTIVATE)
+    assert peer.set('/compensator', 'max_rate', 0.1).successful
+    assert peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
-    assert changed_state(peer, Transition.TRANSITION_ACTIVATE)
+    assert peer.change('/compensator', Transition.TRANSITION_ACTIVATE)
     assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-    peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
+    peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
     plant.applies = False
     peer.until(lambda: 'does not tell the offsets' in compensator.text, 'a controller that tells nothing')
-    assert changed_state(peer, Transition.TRANSITION_DEACTIVATE)
+    assert peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
     peer.until(lambda: 'is left with the controller' in compensator.text, 'what is left')
     assert plant.step() <= WITHIN
 
@@ -173,11 +158,7 @@ def test_main_thread_that_hangs_lets_offsets_hold(domain: int, peer: Any) -> Non
     process = subprocess.Popen([sys.executable, '-c', HANGS, *ARGUMENTS, '--stale', STALE], cwd=ROOT, stdin=reading)
     os.close(reading)
     try:
-        plant = Plant(peer.node)
-        peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-        free = plant.error()
-        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: plant.error() < 0.5 * free, 'offsets that follow')
+        plant = following(peer, share=0.5)
         client = peer.node.create_client(SetBool, '/compensator/enable')
         peer.until(client.service_is_ready, 'the service')
         client.call_async(SetBool.Request(data=False))
@@ -230,11 +211,7 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
 
 @pytest.mark.slow
 def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program, peer: Any) -> None:
-    plant = Plant(peer.node)
-    free = 2e-3
-    peer.until(lambda: plant.error() > free, 'a deflection')
-    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-    peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
+    plant = following(peer)
     states = peer.collect(DiagnosticArray, '/diagnostics')
     senders = {
         topic: peer.node.create_publisher(type(message), topic, 5) for message, topic, _ in strange_messages().values()
@@ -347,7 +324,7 @@ def test_a_gate_that_fails_on_the_way_out_leaves_no_offset(domain: int, peer: An
         peer.until(lambda: plant.error() > 2e-3, 'a deflection')
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
         peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
-        changed_state(peer, Transition.TRANSITION_DEACTIVATE)
+        peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
         peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
         assert plant.step() <= WITHIN
     finally:

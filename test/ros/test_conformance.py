@@ -25,7 +25,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, WrenchStamped
 from lifecycle_msgs.msg import State, Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import GetState
 from rcl_interfaces.msg import Log, ParameterValue
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
@@ -104,8 +104,7 @@ class Running:
         return self.peer.call(kind, f'{NAMESPACE}/{self.name}/{service}', request)
 
     def set(self, name: str, value: object) -> Any:
-        message = Parameter(name, value=value).to_parameter_msg()
-        return self.call(SetParameters, 'set_parameters', SetParameters.Request(parameters=[message])).results[0]
+        return self.peer.set(f'{NAMESPACE}/{self.name}', name, value)
 
     def get(self, name: str) -> Any:
         values = self.call(GetParameters, 'get_parameters', GetParameters.Request(names=[name])).values
@@ -121,9 +120,7 @@ class Running:
         return int(self.call(GetState, 'get_state', GetState.Request()).current_state.id)
 
     def change(self, transition: int) -> bool:
-        request = ChangeState.Request()
-        request.transition.id = transition
-        return bool(self.call(ChangeState, 'change_state', request).success)
+        return self.peer.change(f'{NAMESPACE}/{self.name}', transition)
 
     def send(self, sent: Sent) -> None:
         kind, topic, message = sent

@@ -14,7 +14,6 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
@@ -256,9 +255,7 @@ def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) 
     rejected(arm.goal((0.0,) * 60_000, names=('x',) * 60_000), ' bytes: must be at most 1000000')
     assert arm.controller is not None
     assert arm.controller.goals == []
-    request = ChangeState.Request()
-    request.transition.id = Transition.TRANSITION_DEACTIVATE
-    assert arm.peer.call(ChangeState, '/shaper/change_state', request).success
+    assert arm.peer.change('/shaper', Transition.TRANSITION_DEACTIVATE)
     rejected(arm.goal(), 'the node is not active')
 
 
@@ -371,9 +368,7 @@ def test_a_stopped_shaper_stops_the_arm(begin: Callable[..., Arm]) -> None:
     arm = begin()
     handle = arm.send(arm.goal(seconds=20.0))
     arm.peer.until(arm.moves, 'motion')
-    request = ChangeState.Request()
-    request.transition.id = Transition.TRANSITION_DEACTIVATE
-    assert arm.peer.call(ChangeState, '/shaper/change_state', request).success
+    assert arm.peer.change('/shaper', Transition.TRANSITION_DEACTIVATE)
     response = arm.result(handle)
     assert (response.status, response.result.error_string) == (ABORTED, 'the shaper was deactivated')
     assert arm.controller is not None

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
+from rcl_interfaces.srv import GetParameters
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -155,14 +154,9 @@ def test_settings_are_parameters(node: Program, peer: Any) -> None:
     assert (kind.string_value, frequency.double_value) == ('zvd', FREQUENCY)
     assert (step.double_value, lead.double_value) == (0.05, 0.1)
 
-    def changed(name: str, value: float) -> Any:
-        new = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=new)])
-        return peer.call(SetParameters, '/shaper/set_parameters', request).results[0]
-
-    assert changed('max_step', 0.01).successful
-    assert not changed('max_step', -1.0).successful
-    assert not changed('frequency', 10.0).successful
+    assert peer.set('/shaper', 'max_step', 0.01).successful
+    assert not peer.set('/shaper', 'max_step', -1.0).successful
+    assert not peer.set('/shaper', 'frequency', 10.0).successful
     given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
     reported(peer, shoulder=0.0, elbow=0.02)

@@ -94,13 +94,15 @@ class ScriptedDevice:
 
 
 class Estimates:
-    """A sink; ``enough`` is set with the ``wanted``-th block that has an estimate."""
+    """A sink that keeps what it gets; ``enough`` is set with the ``wanted``-th block that has an estimate."""
 
-    def __init__(self, wanted: int) -> None:
+    def __init__(self, wanted: int = 0) -> None:
+        self.records: list[Record] = []
         self.enough = threading.Event()
         self._wanted = wanted
 
     def put(self, record: Record) -> None:
+        self.records.append(record)
         if isinstance(record, DeflectionEstimate) and record.primary:
             self._wanted -= 1
             if self._wanted == 0:

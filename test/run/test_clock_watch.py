@@ -19,7 +19,8 @@ def sample(seq: int, t_us: int | None = None) -> SampleFrame:
     return SampleFrame(0, seq % 2**32, seq * 1000 if t_us is None else t_us, COUNTS)
 
 
-def watch() -> ClockWatch:
+@pytest.fixture
+def watched() -> ClockWatch:
     return ClockWatch(1000.0, regressed=True)
 
 
@@ -27,15 +28,13 @@ def host_of(watched: ClockWatch, t_us: int) -> int:
     return int(watched.to_host_ns(np.array([t_us], np.int64))[0])
 
 
-def test_only_newest_sample_of_read_sets_the_clock() -> None:
-    watched = watch()
+def test_only_newest_sample_of_read_sets_the_clock(watched: ClockWatch) -> None:
     assert not watched.newest([sample(0), sample(1), BadFrame('x', 3), sample(2), BadFrame('y', 1)], BOOT + 2 * MS)
     assert host_of(watched, 0) == BOOT
     assert host_of(watched, 2000) == BOOT + 2 * MS
 
 
-def test_a_read_without_a_sample_says_nothing() -> None:
-    watched = watch()
+def test_a_read_without_a_sample_says_nothing(watched: ClockWatch) -> None:
     assert not watched.newest([BadFrame('x', 3)], BOOT)
     assert not watched.newest([], BOOT)
     assert watched.state().points == 0
@@ -43,14 +42,12 @@ def test_a_read_without_a_sample_says_nothing() -> None:
     assert host_of(watched, 7000) == BOOT + 7 * MS
 
 
-def test_samples_of_a_plug_in_count_as_frames_do() -> None:
-    watched = watch()
+def test_samples_of_a_plug_in_count_as_frames_do(watched: ClockWatch) -> None:
     watched.newest([Sample(0, 3, 3000, COUNTS)], BOOT + 3 * MS)
     assert host_of(watched, 3000) == BOOT + 3 * MS
 
 
-def test_repeated_or_implausible_sample_is_ignored() -> None:
-    watched = watch()
+def test_repeated_or_implausible_sample_is_ignored(watched: ClockWatch) -> None:
     watched.newest([sample(100)], BOOT + 100 * MS)
     before = watched.state()
     # Shown, both would be a jump of the clock.
@@ -59,8 +56,7 @@ def test_repeated_or_implausible_sample_is_ignored() -> None:
     assert watched.state() == before
 
 
-def test_a_jump_is_observed_sample_by_sample() -> None:
-    watched = watch()
+def test_a_jump_is_observed_sample_by_sample(watched: ClockWatch) -> None:
     for k in range(5):
         assert not watched.torn(k, k * 1000)
         assert not watched.observe(k, k * 1000, BOOT + k * MS)
@@ -73,8 +69,8 @@ def test_a_jump_is_observed_sample_by_sample() -> None:
 
 @pytest.mark.parametrize('jump_us', [2000, 5000, 30_000, 45_000, -2000, -5000])
 @pytest.mark.parametrize('rate', [1.0, 1.0 + 500e-6])
-def test_a_jump_of_two_milliseconds_is_followed_within_a_second(jump_us: int, rate: float) -> None:
-    watched, rng, late, steps = watch(), np.random.default_rng(1), {}, []
+def test_a_jump_of_two_milliseconds_is_followed_within_a_second(watched: ClockWatch, jump_us: int, rate: float) -> None:
+    rng, late, steps = np.random.default_rng(1), {}, []
     for k in range(24_000):
         t_us = round(k * 1000 * rate) + (jump_us if k >= 20_507 else 0)
         now = BOOT + k * MS + 200_000 + int(rng.exponential(50_000))
@@ -92,22 +88,20 @@ def test_a_jump_of_two_milliseconds_is_followed_within_a_second(jump_us: int, ra
     assert abs(late[23_999] - late[20_500]) < 500_000
 
 
-def test_stamps_that_jitter_show_no_step() -> None:
-    watched, rng = watch(), np.random.default_rng(2)
+def test_stamps_that_jitter_show_no_step(watched: ClockWatch) -> None:
+    rng = np.random.default_rng(2)
     for k in range(5000):
         watched.torn(k, k * 1000)
         assert not watched.stepped(k, k * 1000 + int(rng.choice([0, 3000])))
 
 
-def test_a_gap_in_the_numbers_is_not_a_clock_jump() -> None:
-    watched = watch()
+def test_a_gap_in_the_numbers_is_not_a_clock_jump(watched: ClockWatch) -> None:
     assert not watched.torn(0, 0)
     assert not watched.torn(5000, 5_000_000)
     assert watched.torn(5001, 5_001_000 + 60_000)
 
 
-def test_numbers_may_wrap() -> None:
-    watched = watch()
+def test_numbers_may_wrap(watched: ClockWatch) -> None:
     last = 2**32 - 1
     assert not watched.newest([sample(last, t_us=1000)], BOOT)
     assert not watched.newest([sample(0, t_us=2000)], BOOT + MS)
@@ -115,8 +109,7 @@ def test_numbers_may_wrap() -> None:
     assert watched.state().resets == 0
 
 
-def test_an_answer_to_a_ping_bounds_the_delay() -> None:
-    watched = watch()
+def test_an_answer_to_a_ping_bounds_the_delay(watched: ClockWatch) -> None:
     watched.newest([sample(0)], BOOT + 3 * MS)
     watched.torn(0, 0)
     watched.reply(1000, BOOT + 3 * MS, BOOT + 4 * MS)
@@ -125,8 +118,7 @@ def test_an_answer_to_a_ping_bounds_the_delay() -> None:
 
 
 @pytest.mark.parametrize(('claimed_us', 'believed'), [(100_400, True), (145_400, False), (55_000, False)])
-def test_an_answer_to_a_ping_lies_between_the_samples_around_it(claimed_us: int, believed: bool) -> None:
-    watched = watch()
+def test_ping_answer_lies_between_the_samples_around_it(watched: ClockWatch, claimed_us: int, believed: bool) -> None:
     for k in range(101):
         watched.newest([sample(k)], BOOT + k * MS)
         watched.torn(k, k * 1000)
@@ -138,8 +130,7 @@ def test_an_answer_to_a_ping_lies_between_the_samples_around_it(claimed_us: int,
     assert abs(host_of(watched, 100_000) - before) < 10_000
 
 
-def test_an_answer_across_a_jump_of_the_clock_is_not_believed() -> None:
-    watched = watch()
+def test_an_answer_across_a_jump_of_the_clock_is_not_believed(watched: ClockWatch) -> None:
     watched.newest([sample(0)], BOOT)
     watched.torn(0, 0)
     watched.reply(500, BOOT, BOOT + MS)
@@ -149,7 +140,7 @@ def test_an_answer_across_a_jump_of_the_clock_is_not_believed() -> None:
 
 def stamped(clock_us: list[int]) -> list[int]:
     """How late the stamp of each of these samples is, ns: one a millisecond, each read as it comes."""
-    watched = watch()
+    watched = ClockWatch(1000.0, regressed=True)
     late = []
     for k, t_us in enumerate(clock_us):
         now = BOOT + k * MS
@@ -169,8 +160,7 @@ def test_a_clock_that_stands_still_or_crawls_is_laid_anew(share: float) -> None:
     assert max(late) < 60 * MS
 
 
-def test_a_line_that_was_held_up_is_no_lag() -> None:
-    watched = watch()
+def test_a_line_that_was_held_up_is_no_lag(watched: ClockWatch) -> None:
     for k in range(1000):
         # What the host has not read for a second comes at once.
         now = BOOT + max(k, 999) * MS
@@ -178,8 +168,7 @@ def test_a_line_that_was_held_up_is_no_lag() -> None:
         assert not watched.lags(k, k * 1000, now)
 
 
-def test_a_device_that_is_faster_than_it_says_does_not_lag() -> None:
-    watched = watch()
+def test_a_device_that_is_faster_than_it_says_does_not_lag(watched: ClockWatch) -> None:
     for k in range(3000):
         t_us, now = k * 900, BOOT + k * 900_000
         watched.newest([sample(k, t_us)], now)
@@ -198,9 +187,8 @@ def test_times_that_need_no_map_go_through_as_they_are(t: int) -> None:
     assert watched.state().round_trip_ns is None
 
 
-def test_clock_recovers_from_burst_of_tenfold_rate() -> None:
+def test_clock_recovers_from_burst_of_tenfold_rate(watched: ClockWatch) -> None:
     """Against the contract: the numbers run ahead of the time, a little at each sample."""
-    watched = watch()
     seq = t_us = 0
 
     def read(samples: int, step_us: int, late_ns: int) -> None:

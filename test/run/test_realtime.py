@@ -41,47 +41,35 @@ class Clock:
         return self.now
 
 
-def test_watchdog_signals_twice_per_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    systemd, clock = Systemd(tmp_path / 'notify'), Clock()
-    monkeypatch.setenv('NOTIFY_SOCKET', str(tmp_path / 'notify'))
-    monkeypatch.setenv('WATCHDOG_USEC', '4000000')
-    monkeypatch.setenv('WATCHDOG_PID', str(os.getpid()))
-    watchdog = Watchdog(clock)
-    watchdog.ready()
-    for _ in range(100):
-        watchdog.alive()
-        clock.now += 0.1
-    watchdog.stopping()
-    assert systemd.heard() == ['READY=1', *['WATCHDOG=1'] * 5, 'STOPPING=1']
-    systemd.socket.close()
-
-
 @pytest.mark.parametrize(
-    'environment',
+    ('environment', 'heard'),
     [
-        {},
-        {'NOTIFY_SOCKET': '/nowhere/notify'},
-        {'WATCHDOG_USEC': 'x'},
-        {'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': 'x'},
-        {'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': '4000000', 'WATCHDOG_PID': '1'},
+        ({}, []),
+        ({'NOTIFY_SOCKET': '/nowhere/notify'}, []),
+        ({'WATCHDOG_USEC': 'x'}, []),
+        ({'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': 'x'}, ['READY=1', 'STOPPING=1']),
+        ({'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': '4000000', 'WATCHDOG_PID': '1'}, ['READY=1', 'STOPPING=1']),
+        (
+            {'NOTIFY_SOCKET': 'ours', 'WATCHDOG_USEC': '4000000', 'WATCHDOG_PID': 'own'},
+            ['READY=1', *['WATCHDOG=1'] * 5, 'STOPPING=1'],
+        ),
     ],
 )
-def test_watchdog_does_nothing_without_systemd(
-    environment: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_watchdog_signals_twice_per_interval_if_asked_to(
+    environment: dict[str, str], heard: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     systemd, clock = Systemd(tmp_path / 'notify'), Clock()
     for name in ('NOTIFY_SOCKET', 'WATCHDOG_USEC', 'WATCHDOG_PID'):
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
-        monkeypatch.setenv(name, str(tmp_path / 'notify') if value == 'ours' else value)
+        monkeypatch.setenv(name, {'ours': str(tmp_path / 'notify'), 'own': str(os.getpid())}.get(value, value))
     watchdog = Watchdog(clock)
     watchdog.ready()
     for _ in range(100):
         watchdog.alive()
         clock.now += 0.1
     watchdog.stopping()
-    asked = environment.get('NOTIFY_SOCKET') == 'ours'
-    assert systemd.heard() == (['READY=1', 'STOPPING=1'] if asked else [])
+    assert systemd.heard() == heard
     systemd.socket.close()
 
 

@@ -141,18 +141,8 @@ def test_zero_of_long_silent_device_is_rejected(running: Running, monkeypatch: p
         running.session.zero()
 
 
-class Observed:
-    """A sink that keeps what it gets."""
-
-    def __init__(self) -> None:
-        self.records: list[Record] = []
-
-    def put(self, record: Record) -> None:
-        self.records.append(record)
-
-
 def test_annotated_load_holds_for_the_next_recording(running: Running, device: ScriptedDevice, sample: Sample) -> None:
-    session, observed = running.session, Observed()
+    session, observed = running.session, Estimates()
     session.input_sinks.append(observed)
     first = session.note_load(0.0, -10.0, 0.5)
     running.heard('load noted: Fx 0 N, Fy -10 N, Tz 0.5 N·m')
@@ -199,7 +189,7 @@ def test_past_load_is_stamped_with_its_own_time(running: Running, device: Script
 def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -> None:
     session = running.session
     shown = ShownSession(session)
-    observed = Observed()
+    observed = Estimates()
     session.input_sinks.append(observed)
     before = session.acquisition.now_ns()
     shown.mark('bumped it', 8.0)
@@ -217,7 +207,7 @@ def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -
 
 
 def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:
-    session, observed = running.session, Observed()
+    session, observed = running.session, Estimates()
     session.input_sinks.append(observed)
     folder = session.record(True).result(WAIT_S)
     assert folder is not None
@@ -232,7 +222,7 @@ def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDe
 
 
 def test_invalid_or_frequent_mark_is_rejected(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    session, observed = running.session, Observed()
+    session, observed = running.session, Estimates()
     session.input_sinks.append(observed)
     for text in ('', 'x' * 201, 'a\x1b[31m', '\ud800'):
         with pytest.raises(ValueError, match='a mark'):
@@ -249,7 +239,7 @@ def test_invalid_or_frequent_mark_is_rejected(running: Running, monkeypatch: pyt
 
 
 def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) -> None:
-    observed = Observed()
+    observed = Estimates()
     running.session.input_sinks.append(observed)
 
     def give(pose: ReferencePose) -> Record | None:

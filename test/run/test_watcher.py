@@ -76,6 +76,12 @@ class Chain:
                 self.fanout.put(record)
                 self.watcher.put(record)
 
+    def bump(self) -> None:
+        """Eight seconds under no load, then six after x1 has moved."""
+        self.load(0.0, 0.0, 0.0)
+        self.feed(8.0)
+        self.feed(6.0, BUMP)
+
 
 BUMP = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -137,9 +143,7 @@ def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
 def test_what_is_still_to_be_kept_is_kept_at_the_end(tmp_path: Path) -> None:
     chain = Chain(tmp_path / 'deep' / 'below')
     chain.feed(0.2)
-    chain.load(0.0, 0.0, 0.0)
-    chain.feed(8.0)
-    chain.feed(6.0, BUMP)
+    chain.bump()
     assert chain.watcher.watch.alarms == 1
     assert chain.watcher.close(60.0) == ''
     assert chain.watcher.folder is not None
@@ -149,9 +153,7 @@ def test_what_is_still_to_be_kept_is_kept_at_the_end(tmp_path: Path) -> None:
 def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     chain = Chain(None)
-    chain.load(0.0, 0.0, 0.0)
-    chain.feed(8.0)
-    chain.feed(6.0, BUMP)
+    chain.bump()
     assert chain.watcher.watch.alarms == 1
     assert chain.watcher.close(1.0) == ''
     assert chain.watcher.folder is None
@@ -163,9 +165,7 @@ def test_a_disk_without_room_is_reported(tmp_path: Path, monkeypatch: pytest.Mon
     usage = SimpleNamespace(free=1_000_000)
     monkeypatch.setattr('psd_deflection.run.recorder.shutil', cast(Any, SimpleNamespace(disk_usage=lambda _: usage)))
     chain = Chain(tmp_path)
-    chain.load(0.0, 0.0, 0.0)
-    chain.feed(8.0)
-    chain.feed(6.0, BUMP)
+    chain.bump()
     assert chain.watcher.close(60.0) == ''
     assert not list(tmp_path.iterdir())
     assert 'disk_reserve' in chain.logged[-1]
@@ -236,9 +236,7 @@ def keep(folder: Path, name: str, age: int, *extra: str) -> Path:
 
 
 def an_alarm(chain: Chain) -> Path:
-    chain.load(0.0, 0.0, 0.0)
-    chain.feed(8.0)
-    chain.feed(6.0, BUMP)
+    chain.bump()
     assert chain.watcher.close(60.0) == ''
     assert chain.watcher.folder is not None
     return chain.watcher.folder

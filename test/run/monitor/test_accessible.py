@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """No page of ours has a violation that axe-core finds: colours, names, labels, landmarks, order of headings."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -15,13 +15,6 @@ from .browsing import Page
 from .serving import BLOCK_NS, START_NS, Serving
 
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope='module')
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    one = Page(tmp_path_factory.mktemp('profile'))
-    yield one
-    one.close()
 
 
 def audit(page: Page, ready: str) -> None:

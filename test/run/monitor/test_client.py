@@ -193,18 +193,6 @@ def test_a_load_that_is_no_number_says_so(text: str, capsys: pytest.CaptureFixtu
     assert ('decimals have a point' in output) == (',' in text)
 
 
-@pytest.mark.parametrize('url', ['ftp://rig/', 'http://', 'http://rig:99999/', 'http://[::1/'])
-def test_invalid_address_is_a_usage_error(url: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['zero', '--url', url]) == 2
-    assert f'--url = {url}: is no address' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('values', [['nan', '0', '0'], ['0', 'inf', '0']])
-def test_a_load_is_finite(values: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['load', *values]) == 2
-    assert 'must be finite' in capsys.readouterr().err
-
-
 @pytest.fixture
 def stranger() -> Iterator[str]:
     """A web server of somebody else."""

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import re
+from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
@@ -29,23 +30,28 @@ def blocks(volts: npt.NDArray[np.float64], lose: frozenset[int] = frozenset()) -
     ]
 
 
+def spectrum_of(given: Iterable[SampleBlock]) -> Spectrum:
+    spectrum = Spectrum(RIG)
+    for block in given:
+        spectrum.add(block)
+    return spectrum
+
+
+def density_of(given: Iterable[SampleBlock]) -> npt.NDArray[np.float64]:
+    density = spectrum_of(given).density()
+    assert density is not None
+    return density
+
+
 def test_white_noise_has_its_density_and_a_sine_its_power() -> None:
     rng = np.random.default_rng(1)
     # 2 mV rms of white noise at 1 kHz is 2 mV / sqrt(500 Hz), times 0.5 mm/V.
-    spectrum = Spectrum(RIG)
-    for block in blocks(rng.normal(0.0, 2e-3, 4000)):
-        spectrum.add(block)
-    density = spectrum.density()
-    assert density is not None
+    density = density_of(blocks(rng.normal(0.0, 2e-3, 4000)))
     assert density.shape == (4, SEGMENT // 2)
     assert np.sqrt((density[0] ** 2).mean()) == pytest.approx(2e-3 * 0.5e-3 / np.sqrt(500.0), rel=0.05)
     t = np.arange(4000) / 1000.0
-    spectrum = Spectrum(RIG)
-    for block in blocks(0.1 * np.sin(2.0 * np.pi * 14.0 * t)):
-        spectrum.add(block)
-    density = spectrum.density()
-    assert density is not None
-    frequencies = spectrum.frequencies
+    density = density_of(blocks(0.1 * np.sin(2.0 * np.pi * 14.0 * t)))
+    frequencies = Spectrum(RIG).frequencies
     assert frequencies[int(density[0].argmax())] == pytest.approx(14.0, abs=1.0)
     # Parseval: the area under the squared density is the variance of the dot, (0.1 V * 0.5 mm/V)^2 / 2.
     area = (density[0] ** 2).sum() * (frequencies[1] - frequencies[0])
@@ -55,26 +61,17 @@ def test_white_noise_has_its_density_and_a_sine_its_power() -> None:
 
 def test_a_segment_never_spans_a_loss() -> None:
     rng = np.random.default_rng(2)
-    spectrum = Spectrum(RIG)
-    for block in blocks(rng.normal(0.0, 1.0, 4000), lose=frozenset(range(500, 4000, 1000))):
-        spectrum.add(block)
-    assert spectrum.density() is None
+    lossy = blocks(rng.normal(0.0, 1.0, 4000), lose=frozenset(range(500, 4000, 1000)))
+    assert spectrum_of(lossy).density() is None
     # A step where samples are missing: seen as one segment it would be a large low-frequency line.
     volts = np.where(np.arange(4000) < 2000, 0.0, 1.0)
-    spectrum = Spectrum(RIG)
-    for block in blocks(volts, lose=frozenset({1999})):
-        spectrum.add(block)
-    density = spectrum.density()
-    assert density is not None
-    assert density[0].max() < 1e-12
+    assert density_of(blocks(volts, lose=frozenset({1999})))[0].max() < 1e-12
 
 
 def test_it_keeps_four_seconds_and_restarts_when_numbers_go_back() -> None:
-    spectrum = Spectrum(RIG)
     noisy = np.zeros(12_000)
     noisy[:6000] = np.random.default_rng(3).normal(0.0, 1.0, 6000)
-    for block in blocks(noisy):
-        spectrum.add(block)
+    spectrum = spectrum_of(blocks(noisy))
     density = spectrum.density()
     assert density is not None
     assert density[0].max() == 0.0
@@ -87,36 +84,26 @@ def test_samples_without_light_are_no_dots() -> None:
     lit, dark = blocks(rng.normal(1.0, 2e-3, 4000)), blocks(np.zeros(4000))
     for block in dark:
         block.volts[:, 2] = 0.01
-    spectrum = Spectrum(RIG)
     # The dot stands at 0.5 mm; counted as one at 0 mm, the dark part in the middle would be a step.
-    for block in [*lit[:80], *dark[80:120], *lit[120:]]:
-        spectrum.add(block)
-    density = spectrum.density()
-    assert density is not None
+    density = density_of([*lit[:80], *dark[80:120], *lit[120:]])
     assert np.sqrt((density[0] ** 2).mean()) == pytest.approx(2e-3 * 0.5e-3 / np.sqrt(500.0), rel=0.1)
     # PSD 1 dark, or its sum not a number, all along: nothing of it, and PSD 2 is told all the same.
     for sum1 in (0.01, np.nan):
-        spectrum = Spectrum(RIG)
-        for block in blocks(rng.normal(0.0, 2e-3, 4000)):
+        half = blocks(rng.normal(0.0, 2e-3, 4000))
+        for block in half:
             block.volts[:, 2] = sum1
-            spectrum.add(block)
-        density = spectrum.density()
-        assert density is not None
+        density = density_of(half)
         assert np.isnan(density[:2]).all()
         assert (density[2:] == 0.0).all()
         # NaN is no JSON: a browser would reject the whole message.
         assert json.loads(density_json(density)) == [[None] * (SEGMENT // 2)] * 2 + [[0.0] * (SEGMENT // 2)] * 2
-    spectrum = Spectrum(RIG)
     for block in dark:
         block.volts[:, 5] = 0.01
-        spectrum.add(block)
-    assert spectrum.density() is None
+    assert spectrum_of(dark).density() is None
 
 
 def entry_of(volts: npt.NDArray[np.float64]) -> DiagnosticEntry:
-    spectrum = Spectrum(RIG)
-    for block in blocks(volts):
-        spectrum.add(block)
+    spectrum = spectrum_of(blocks(volts))
     return line_entry(RIG, spectrum.frequencies, spectrum.density())
 
 
