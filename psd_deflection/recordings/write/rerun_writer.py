@@ -107,7 +107,7 @@ class RerunFile:
             return
         step, blocks = s.t_ns - before.t_ns, s.index - before.index
         if blocks > 1:
-            ends = (before.t_ns + round(step / blocks), s.t_ns - round(step / blocks))
+            ends: tuple[int, ...] = (before.t_ns + round(step / blocks), s.t_ns - round(step / blocks))
             for t_ns in dict.fromkeys(ends):
                 self._add('lost', t_ns, (s.present + s.lost,))
         elif 0.5 < step / self._block_ns < GAP:
