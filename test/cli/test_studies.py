@@ -97,26 +97,6 @@ def test_the_rig_file_is_the_one_that_was_given_and_corrects(made: Path, tmp_pat
     assert errors['after'] < 0.1 * errors['before']
 
 
-@pytest.mark.parametrize(
-    ('argv', 'status', 'words'),
-    [
-        ([], 2, '--out DIR .* or --check'),
-        (['--check', str(RIG), '--out', 'x'], 2, 'give none of --params-file, --out'),
-        (['--reference', 'a', '--reference', 'b', '--out', 'x'], 2, '--reference is given 2 times for 1 recordings'),
-        (['--check', str(RIG)], 3, 'calibration.names: not there; --check takes the rig.yaml of a calibration'),
-    ],
-)
-def test_what_does_not_fit_is_rejected(
-    made: Path, argv: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    try:
-        ended = main(['calibrate', str(made / 'run.csv'), *argv])
-    except SystemExit as stop:
-        ended = int(str(stop.code))
-    assert ended == status
-    assert re.search(words, capsys.readouterr().err)
-
-
 @pytest.fixture(scope='module')
 def off(made: Path) -> Path:
     """Both lasers off, in light that is 2 % and 1 % of theirs."""
@@ -147,6 +127,10 @@ def test_dark_levels_alone_change_nothing_else(off: Path, tmp_path: Path, capsys
 @pytest.mark.parametrize(
     ('argv', 'status', 'words'),
     [
+        (['RUN'], 2, '--out DIR .* or --check'),
+        (['RUN', '--check', str(RIG), '--out', 'x'], 2, 'give none of --params-file, --out'),
+        (['RUN', '--reference', 'a', '--reference', 'b', '--out', 'x'], 2, '--reference is given 2 times for 1 rec'),
+        (['RUN', '--check', str(RIG)], 3, 'calibration.names: not there; --check takes the rig.yaml of a calibration'),
         (['--out', 'x'], 2, 'REC is missing'),
         (['--self', '--dark', 'OFF', '--out', 'x'], 2, 'REC is missing'),
         (['RUN', '--check', 'RIG', '--dark', 'OFF'], 2, '--check RIG.yaml is for itself: .*--dark'),
@@ -159,7 +143,7 @@ def test_dark_levels_alone_change_nothing_else(off: Path, tmp_path: Path, capsys
         ),
     ],
 )
-def test_what_does_not_go_with_dark_levels_is_rejected(
+def test_what_does_not_fit_is_rejected(
     made: Path, off: Path, argv: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     named = {'RUN': str(made / 'run.csv'), 'OFF': str(off), 'RIG': str(made / 'out' / 'rig.yaml')}

@@ -417,8 +417,6 @@ def test_a_remote_serial_port_with_its_line_speed(remote: Remote) -> None:
 
 
 def test_more_than_can_be_read_ends_the_port(remote: Remote, monkeypatch: pytest.MonkeyPatch) -> None:
-    from psd_deflection.devices import tcp_port
-
     monkeypatch.setattr(tcp_port, 'MOST_WAITING', 100)
     port = open_port(remote.name, BAUD)
     remote.device.send(bytes(200))
@@ -431,8 +429,6 @@ def test_more_than_can_be_read_ends_the_port(remote: Remote, monkeypatch: pytest
 def test_a_raw_port_is_not_taken_for_a_remote_serial_port(
     listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from psd_deflection.devices import tcp_port
-
     monkeypatch.setattr(tcp_port, 'OPEN_S', 0.2)
     port = listener.getsockname()[1]
     with pytest.raises(DeviceError, match=r'not as RFC 2217 says; is it a raw port \(socket://\)'):

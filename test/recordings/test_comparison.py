@@ -79,38 +79,36 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     monkeypatch.setattr(ExactSolver, 'solve', lambda *a: altered((s := solve(*a)), dx=s.dx * (1.0 + share)))
 
 
-@pytest.mark.slow
-def test_rounding_of_other_version_is_no_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9', 'numpy': '1.25.0'})
-    disturbed(monkeypatch, 3e-16)
-    assert main(['replay', name, '--compare']) == 0
-    output = capsys.readouterr().out
-    assert 'differ by rounding alone' in output
-    assert 'rounding may differ: recorded with psd_deflection 0.0.9, now ' in output
-    assert 'numpy 1.25.0, now ' in output
-    assert main(['replay', name, '--compare', '--strict']) == 1
+OLD = {'psd_deflection': '0.0.9', 'numpy': '1.25.0'}
+SINCE = 'rounding may differ: recorded with psd_deflection 0.0.9, now '
 
 
-def test_rounding_of_the_same_version_is_a_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ('made_with', 'share', 'status', 'words'),
+    [
+        pytest.param(OLD, 3e-16, 0, ('differ by rounding alone', SINCE, 'numpy 1.25.0, now '), marks=pytest.mark.slow),
+        (None, 3e-16, 1, ('rounding differs although the same versions recorded it: please report this',)),
+        (OLD, 1e-6, 1, ('by rounding alone, ',)),
+    ],
+    ids=['rounding of another version', 'rounding of the same version', 'more than rounding'],
+)
+def test_rounding_alone_of_another_version_is_no_failure(
+    made_with: Mapping[str, str] | None,
+    share: float,
+    status: int,
+    words: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    name = recorded(tmp_path, monkeypatch, None)
+    name = recorded(tmp_path, monkeypatch, made_with)
     assert main(['replay', name, '--compare']) == 0
     assert 'no bit differs' in capsys.readouterr().out
-    disturbed(monkeypatch, 3e-16)
-    assert main(['replay', name, '--compare']) == 1
-    assert 'rounding differs although the same versions recorded it: please report this' in capsys.readouterr().out
-
-
-def test_another_difference_of_another_version_is_a_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9'})
-    disturbed(monkeypatch, 1e-6)
-    assert main(['replay', name, '--compare']) == 1
-    assert 'by rounding alone, ' in capsys.readouterr().out
+    disturbed(monkeypatch, share)
+    assert main(['replay', name, '--compare']) == status
+    output = capsys.readouterr().out
+    assert all(word in output for word in words), output
+    assert main(['replay', name, '--compare', '--strict']) == 1
 
 
 def test_recording_names_its_provenance(
