@@ -106,7 +106,7 @@ def test_what_is_made_for_two_is_rejected(three: Rig, changes: dict[str, object]
 
 def test_samples_of_three_psds_are_none_of_a_rig_of_two(three: Rig) -> None:
     with pytest.raises(ConfigError, match='the samples are of 3 PSDs, the rig file has 2 '):
-        list(Pipeline(load_rig()).process(chunk_of(at_rest(three, np.zeros(6), 20, 1))))
+        list(Pipeline(load_rig()).process(chunk(at_rest(three, np.zeros(6), 20, 1))))
 
 
 FAILS = 1800
