@@ -115,6 +115,13 @@ def test_a_rim_has_sixteen_parts_of_equal_angle() -> None:
     assert np.count_nonzero(np.diff(parts)) == 15
 
 
+@pytest.mark.parametrize('size', [0.0, 1e-10, 1e-8, 1.0])
+def test_a_turn_is_that_of_its_vector_however_small(size: float) -> None:
+    vector = size * np.array([0.6, -0.3, 0.2])
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rotation_matrix(vector), expected, atol=1e-16 + 1e-15 * size)
+
+
 def test_a_fit_stays_within_its_bounds() -> None:
     shape = Shape(np.eye(3), np.array([0.0, 0.0, 1.0]), 1.0, np.eye(2), np.zeros(4), np.zeros((3, 6)), np.zeros(2))
     light, step = np.ones((3, 6)), np.zeros(16)
@@ -275,6 +282,27 @@ def test_three_thin_scratches_are_no_oblique_target(thick: int, why: Status) -> 
     with pytest.raises(NoPoseError) as caught:
         find_discs(grey, 25.0 / 8.0)
     assert caught.value.status is why
+
+
+@pytest.mark.parametrize('bits', [8, 16])
+def test_target_gets_grey_levels_up_to_255(bits: int) -> None:
+    """Of an image of 16 rows at least, the fewest that are read."""
+    got: list[tuple[Any, ...]] = []
+
+    def locate(*of: Any) -> TargetPose:
+        got.append(of)
+        raise NoPoseError(Status.MISSING)
+
+    for rows, status in ((16, Status.MISSING), (15, Status.UNREADABLE)):
+        image = np.full((rows, 20), 100 if bits == 8 else 100 * 257, f'u{bits // 8}')
+        reference = CameraReference(CameraSettings(), lambda _: cast(Any, SimpleNamespace(locate=locate)))
+        assert [a.status for a in reference.take(0, image)] == [status]
+    ((image, grey, lens, full_scale),) = got
+    assert (image == 100.0).all()
+    assert (grey.dtype, full_scale) == (np.uint8, 255.0)
+    assert (grey == 100).all()
+    # A lens that is not known looks at the middle from so far away that there is no perspective.
+    assert lens.matrix.tolist() == [[20e3, 0.0, 9.5], [0.0, 20e3, 7.5], [0.0, 0.0, 1.0]]
 
 
 @pytest.mark.parametrize(('rest_frames', 'last'), [(0, 400), (30, 400), (300, 600)])

@@ -86,6 +86,8 @@ def test_every_size_in_the_settings_is_of_some_kind() -> None:
     own = {f'{SETTINGS.parameters[name].name}' for kind in TARGETS for name in target_class(kind).own}
     sizes = {p.name for p in SETTINGS.parameters.values() if p.name.startswith('target.')}
     assert sizes - own == {'target.kind'}
+    # Each of them may be set while the node runs.
+    assert [p.name for p in SETTINGS.parameters.values() if not p.live] == ['frame_prefix']
 
 
 SMALL = Scene(width=400, height=320, focal=1000.0, centre=(195.0, 162.0), distance=0.25, distortion=(-0.1, 0.05))

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from blind import motion
 from psd_deflection.measure.motion.inertia import Inertia
-from psd_deflection.measure.motion.modal import BlockTables, KnownLoads, Oscillator
+from psd_deflection.measure.motion.modal import BlockTables, KnownLoads, Oscillator, joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter, TipState
 from psd_deflection.measure.motion.unseen import LARGER, Innovations, UnseenLoads
 from psd_deflection.records import AppliedLoad, BaseAcceleration, FloatArray
@@ -239,6 +239,12 @@ def test_known_load_acts_from_its_stamp_on() -> None:
     np.testing.assert_allclose(found.variance, (0.05 * size) ** 2)
     assert known.is_new(loads[1])
     assert not known.is_new(loads[2])
+
+
+@pytest.mark.parametrize('t_ns', [0, 999_999_999, 1_700_000_000_999_999_999])
+def test_a_time_in_two_numbers_is_exact(t_ns: int) -> None:
+    assert split_ns(t_ns) == (t_ns // 10**9, t_ns % 10**9)
+    assert joined_ns(*split_ns(t_ns)) == t_ns
 
 
 def test_innovations_have_the_band_of_their_chi_square() -> None:

@@ -118,6 +118,14 @@ def test_what_cannot_be_used_is_rejected(base: BaseAcceleration, why: str) -> No
     assert len(known.reported) == 2
 
 
+def test_most_accelerations_that_wait_are_a_hundred_thousand() -> None:
+    known = Inertia(MODES, L)
+    known.reported = [(n, NONE) for n in range(99_999)]
+    known.notify(BaseAcceleration(MS, NONE, NONE), 0)
+    with pytest.raises(ValueError, match='100000 accelerations wait'):
+        known.notify(BaseAcceleration(2 * MS, NONE, NONE), 0)
+
+
 def rotated(seconds: float) -> motion.Run:
     """A joint at the base turns about x to and fro: 4 rad/s^2 from 0.5 s on, -4 from 0.75 s on, and so on."""
     t = np.arange(round(1000 * seconds)) / 1000.0

@@ -14,13 +14,15 @@ import pytest
 from psd_deflection.base.errors import SolverError
 from psd_deflection.model.link.section import TubeSection
 from psd_deflection.model.plate import Geometry
-from psd_deflection.model.solvers.registry import SOLVERS
+from psd_deflection.model.solvers.interface import SolverStatus
+from psd_deflection.model.solvers.registry import SOLVERS, make_solver
 from psd_deflection.studies.thesis.appendix_d import compared, mismatch, tilt_branches
 from psd_deflection.studies.thesis.comparison import (
     CAUSES,
     CONDITIONS,
     DIAMETERS,
     FORCES,
+    VARIANCES,
     Method,
     dots_of,
     errors,
@@ -105,6 +107,9 @@ TABLE_5_1: dict[str, tuple[Cell, Cell]] = {
     'twist, ΔY of Table B1 at 60 N, scaled': ((-7.6, 86.0, 0.1), (-0.5, 29.2, -0.5)),
     'PSDs 22 mm above the section': ((-8.0, 82.3, 5.7), (-0.5, 25.2, 5.1)),
     'both PSDs rotated 1 deg': ((-10.7, 73.2, 1.0), (0.6, 10.7, 0.5)),
+    'both PSDs rotated 3 deg': ((-16.0, 59.5, 2.9), (2.7, -6.4, 2.5)),
+    'beam 1 inclined 1 deg in x': ((-8.6, 78.9, 0.0), (-0.5, 19.2, -0.5)),
+    'beam 1 inclined 1 deg in y': ((-8.6, 84.9, 0.4), (0.0, 19.2, -0.2)),
     'all gains +5 %': ((-3.3, 85.3, 5.1), (4.5, 25.2, 4.5)),
     'pre-load 70/-50 µm left in': ((-8.6, 85.0, 0.0), (6.2, 60.2, 2.7)),
     'camera rolled +1 deg': ((-8.6, 173.5, 0.0), (-0.4, 76.4, -0.5)),
@@ -120,6 +125,13 @@ def test_table_5_1_by_cause(label: str) -> None:
     cause = next(c for c in CAUSES if c.label == label)
     got = table_5_1(cause)
     np.testing.assert_allclose(100.0 * np.array(got), TABLE_5_1[label], atol=0.06)
+
+
+def test_printed_search_without_a_hit_has_no_numbers() -> None:
+    solver = make_solver('iterative_printed', thesis_geometry(), criterion='absolute')
+    found = solver.solve((5e-3, 5e-3, -5e-3, -5e-3), tuple(VARIANCES.tolist()))
+    assert (found.status, found.phi, found.omega, found.iterations) == (SolverStatus.NO_HIT, 0.0, 0.0, 401)
+    assert np.isnan([found.dx, found.dy, found.theta, *found.covariance, *found.residual]).all()
 
 
 def test_every_method_is_a_row_or_is_rejected_with_a_reason() -> None:
@@ -251,6 +263,7 @@ def test_least_squares_error_is_its_neglected_rotation(force: float) -> None:
     truth = spot_run(force, DIAMETERS[0]).truth[-50:].mean(axis=0)
     (least_squares,) = (c for c in spot_changes() if (c.force, c.method) == (force, 'weighted least squares'))
     (iteration,) = (c for c in spot_changes() if (c.force, c.method) == (force, 'iteration'))
+    assert truth[0] == pytest.approx(0.12e-3 * force / 50.0, rel=0.01)
     by_hand = truth[2] * truth[1] - 0.5 * truth[2] ** 2 * 0.1
     assert least_squares.error[0][0] == pytest.approx(by_hand, rel=0.02)
     assert np.abs(iteration.error[0][:2]).max() < 1e-7
