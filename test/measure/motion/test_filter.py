@@ -241,6 +241,16 @@ def test_known_load_acts_from_its_stamp_on() -> None:
     assert not known.is_new(loads[2])
 
 
+def test_known_loads_are_four_numbers_and_five_each() -> None:
+    known = KnownLoads((MODE, MODE, MODE), np.array(COMPLIANCE), N, PERIOD)
+    values = (1.0, 2.0, 3.0, 4.0, 1.0, 5.0, 6.0, 7.0, 8.0)
+    known.load_state('loads', values)
+    assert known.state() == (values[:4], [*values[4:]])
+    for wrong in (3, 5, 8):
+        with pytest.raises(ValueError, match='loads'):
+            known.load_state('loads', values[:wrong])
+
+
 @pytest.mark.parametrize('t_ns', [0, 999_999_999, 1_700_000_000_999_999_999])
 def test_a_time_in_two_numbers_is_exact(t_ns: int) -> None:
     assert split_ns(t_ns) == (t_ns // 10**9, t_ns % 10**9)
