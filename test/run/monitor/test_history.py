@@ -151,7 +151,10 @@ def test_a_clock_that_is_set_back_leaves_what_lies_before() -> None:
     made = filled(row(START_NS + s * SECOND, 1e-3) for s in range(200))
     for s in (10, 150, 190):
         made.mark(START_NS + s * SECOND, f'[{s}]')
+    made.unsaved()
     made.add(row(START_NS + 125 * SECOND, 2e-3))
+    # The file has the marks that are forgotten.
+    assert made.unsaved().marks == [(START_NS + 10 * SECOND, '[10]')]
     for level in (200, 20, 4):
         found = window(made, 0, 200, level)
         assert found.columns['blocks'].sum() == 126
