@@ -1,8 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder thread writes the published messages to a bag without delaying the pipeline: a bounded queue, whose
-overflow is counted; a disk error or too little room ends the recording, never the run. It attaches between two
-blocks."""
+"""The recorder thread writes the published messages to a bag without delaying the pipeline. Messages pass through a
+bounded queue; those that do not fit are counted. A disk error or too little room ends the recording, never the run."""
 
 from __future__ import annotations
 
@@ -24,25 +23,23 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.realtime import SLOW, lag_reason
 
-MESSAGES_PER_BLOCK = 100
-"""The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes
-about ten messages, so the disk may pause ten times as long as the pipeline: 50 s by default, in 25
-MB."""
+QUEUED_PER_BLOCK = 100
+"""The queue holds this many messages for each block of ``queue_blocks``. A block makes about ten, so the disk may pause
+ten times as long as the pipeline: 50 s by default, in 25 MB."""
 MOST_THREADS = 8
-"""Recordings that may hang at a time: each has its thread."""
+"""Recorder threads that are alive at once, as a detached recording is still written; beyond it a start is rejected."""
 QUEUE_BYTES = 100_000_000
 """The recorder's queue holds no more bytes than this."""
 JOIN_S = 1.0
-"""How long the program waits at its end for a recording that takes nothing more."""
+"""At the end of the run, a recording whose queue has not shrunk for this long is given up."""
 PATIENCE_S = 3.0
-"""How long it waits for recordings that are still being written."""
+"""At the end of the run, the longest wait for all recordings together."""
 
 IDLE_S = 0.5
 GATHER_S = 0.005
-"""Pause of the recorder when it has written what there was: waking up for each message costs more than writing it. So
-short that it writes between two blocks of 20 ms, and takes no time from an estimate.
-"""
-LOOK_EVERY = 250
+"""When the queue runs empty, the recorder pauses this long to gather messages: waking up for each costs more than
+writing it. It is short enough to write before the next block (20 ms), so that no estimate is delayed."""
+CHECK_EVERY = 250
 """Messages between two checks of the file and of the room on its disk: half a second's worth."""
 
 ELSEWHERE = 'record elsewhere (parameter bag_dir)'
@@ -86,23 +83,23 @@ class RecordingJob:
         self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self.opened: Future[Path | None] = Future()
         self.closed: Future[Path | None] = Future()
-        # What waits is bounded in bytes too: others may send long messages.
+        # What waits is bounded in bytes too: messages of other nodes (loads, references, marks) may be long.
         self.budget = ByteBudget(QUEUE_BYTES)
-        # Samples that the run had dropped when it began and when it ended, messages that it could
-        # not take.
+        # Samples that the run had dropped when this recording began and when it ended, and messages that did not fit
+        # into the queue.
         self.dropped_before = self.dropped_until = self.dropped_messages = 0
         for answer in (self.opened, self.closed):
             answer.set_running_or_notify_cancel()
 
 
 class Recorder:
-    """Makes one recording at a time; a wire like any other. ``log`` gets a line if a recording ends by itself.
+    """Makes one recording at a time; a sink of the fan-out. ``log`` gets a line if a recording ends by itself.
 
-    ``dropped_samples``: how many the run has dropped so far, before those that it processed last; a
-    recording says how many it lacks because of that. ``between_blocks`` runs an action in the
-    thread that calls the wires (``Processing.request``). ``node``: full name of the recorded ROS
-    node. ``failure``: why the last recording ended by itself, empty while all is well.
-    ``ended_early``: the same of each such recording, by its folder.
+    ``dropped_samples``: returns the number of samples that the run had dropped before the chunk processed last; a
+    recording notes by how much it rose. ``between_blocks`` runs an action in the pipeline thread
+    (``Processing.request``). ``node``: full name of the recorded ROS node. ``dropped``: messages not recorded, over all
+    recordings of the run. ``failure``: why the last recording ended by itself, empty while all is well.
+    ``ended_early``: why each recording that ended by itself did so, by its folder.
     """
 
     def __init__(
@@ -122,13 +119,13 @@ class Recorder:
         self.ended_early: BoundedMap[Path, str] = BoundedMap()
         self._log = log
         self._between_blocks = between_blocks
-        self._limit = queue_blocks * MESSAGES_PER_BLOCK
+        self._limit = queue_blocks * QUEUED_PER_BLOCK
         # Held to swap references and to count, never while waiting for the disk.
         self._lock = threading.Lock()
         # Two recordings opened in one second must not choose the same name.
         self._naming = threading.Lock()
         self._opening: RecordingJob | None = None
-        self._take: RecordingJob | None = None
+        self._job: RecordingJob | None = None
         self._writing: dict[RecordingJob, threading.Thread] = {}
         self._threads: list[threading.Thread] = []
         self._ended = False
@@ -136,8 +133,8 @@ class Recorder:
     @property
     def folder(self) -> Path | None:
         """Folder of the recording, or None while there is none."""
-        take = self._take
-        return take.folder if take is not None else None
+        job = self._job
+        return job.folder if job is not None else None
 
     @property
     def opening(self) -> bool:
@@ -147,8 +144,8 @@ class Recorder:
     @property
     def waiting(self) -> int:
         """Messages that wait for the disk."""
-        take = self._take
-        return take.queue.qsize() if take is not None else 0
+        job = self._job
+        return job.queue.qsize() if job is not None else 0
 
     def start(
         self,
@@ -158,49 +155,49 @@ class Recorder:
     ) -> Future[Path | None]:
         """Start a recording in ``bag_dir``; the future gives its folder once it runs.
 
-        If a recording already runs or starts, its future is returned. ``memory``: called with
-        ``rig`` when the recording is attached; its records come first. The future raises
-        RecordingError if the folder cannot be made, the disk has no room, or the recording was
-        ended before the disk answered; TimeoutError if no data flows.
+        If a recording already runs or starts, its future is returned. ``memory``: called with ``rig`` when the
+        recording is attached; returns the state of the pipeline, which is written first, or None. The future raises
+        RecordingError if the folder cannot be made, the disk has no room, or the recording was ended before the disk
+        answered; TimeoutError if no data flows.
         """
         with self._lock:
-            take = self._take or self._opening
-            if take is None:
-                take = RecordingJob(rig.acquisition)
+            job = self._job or self._opening
+            if job is None:
+                job = RecordingJob(rig.acquisition)
                 if self._ended:
-                    take.opened.set_exception(RecordingError('not recorded: the run has ended'))
-                    return take.opened
+                    job.opened.set_exception(RecordingError('not recorded: the run has ended'))
+                    return job.opened
                 self._threads = [thread for thread in self._threads if thread.is_alive()]
                 if len(self._threads) >= MOST_THREADS:
                     why = f'not recorded: {MOST_THREADS} recordings wait for the disk already'
-                    take.opened.set_exception(RecordingError(why))
-                    return take.opened
+                    job.opened.set_exception(RecordingError(why))
+                    return job.opened
                 thread = threading.Thread(
-                    target=self._run, args=(take, rig, hello, memory), name='recorder', daemon=True
+                    target=self._run, args=(job, rig, hello, memory), name='recorder', daemon=True
                 )
                 thread.start()
                 self._threads = [*self._threads, thread]
-                self._opening = take
-            return take.opened
+                self._opening = job
+            return job.opened
 
     def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
         """Record one message; count it as dropped if the disk is too slow."""
-        take = self._take
-        if take is None:
+        job = self._job
+        if job is None:
             return
-        if take.queue.qsize() >= self._limit or not take.budget.take(len(cdr) + MESSAGE_BYTES):
-            take.dropped_messages += 1
+        if job.queue.qsize() >= self._limit or not job.budget.take(len(cdr) + MESSAGE_BYTES):
+            job.dropped_messages += 1
             self.dropped += 1
             if self.dropped == 1:
-                self._log(f'{take.folder}: messages are dropped: {self._lag_reason(take)}', WARNING)
+                self._log(f'{job.folder}: messages are dropped: {self._lag_reason(job)}', WARNING)
         else:
-            take.queue.put((topic, type_name, cdr, t_ns))
+            job.queue.put((topic, type_name, cdr, t_ns))
 
     def put_change(self, change: ParameterChange) -> None:
         """Record a change of parameters. Never dropped: without it the replay would differ."""
-        take = self._take
-        if take is not None:
-            take.queue.put(change)
+        job = self._job
+        if job is not None:
+            job.queue.put(change)
 
     def stop(self) -> Future[Path | None]:
         """Detach the recording; the future gives its folder once it is closed, None if there was none.
@@ -211,15 +208,15 @@ class Recorder:
         """
         with self._lock:
             opening, self._opening = self._opening, None
-            take, self._take = self._take, None
+            job, self._job = self._job, None
         if opening is not None:
             opening.opened.set_exception(
                 RecordingError('the recording was ended before the disk answered; nothing was recorded')
             )
-        if take is not None:
-            take.dropped_until = self._dropped_samples()
-            take.queue.put(None)
-            return take.closed
+        if job is not None:
+            job.dropped_until = self._dropped_samples()
+            job.queue.put(None)
+            return job.closed
         none: Future[Path | None] = Future()
         none.set_result(None)
         return none
@@ -235,35 +232,34 @@ class Recorder:
             self._ended = True
         ended = self.stop()
         until = time.monotonic() + PATIENCE_S
-        for take, thread in tuple(self._writing.items()):
-            waits = take.queue.qsize() + 1
+        for job, thread in tuple(self._writing.items()):
+            left = job.queue.qsize() + 1
             while thread.is_alive() and time.monotonic() < until:
-                before = waits
+                before = left
                 thread.join(JOIN_S)
-                waits = take.queue.qsize()
-                if waits >= before:
+                left = job.queue.qsize()
+                if left >= before:
                     break
             if thread.is_alive():
-                waiting = f'it is not waited for, and {take.budget.holders} messages are not written'
                 why = (
-                    f'{take.folder}: {self._lag_reason(take)}; {waiting}. '
-                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
+                    f'{job.folder}: {self._lag_reason(job)}; it is not waited for, and {job.budget.holders} messages '
+                    f'are not written. If the file is cut off, `psd-deflection recover {job.folder}` repairs it'
                 )
-                if take.folder is not None:
-                    self._end_early(take.folder, why)
+                if job.folder is not None:
+                    self._end_early(job.folder, why)
                 self._log(why, WARNING)
         return None if ended.done() and ended.exception() is not None else folder
 
     def _end_early(self, folder: Path, why: str) -> None:
         self.failure = self.ended_early[folder] = why
 
-    def _lag_reason(self, take: RecordingJob) -> str:
-        thread = self._writing.get(take)
-        return lag_reason(thread, time.monotonic() - take.beat) if thread is not None else SLOW
+    def _lag_reason(self, job: RecordingJob) -> str:
+        thread = self._writing.get(job)
+        return lag_reason(thread, time.monotonic() - job.beat) if thread is not None else SLOW
 
     def _run(
         self,
-        take: RecordingJob,
+        job: RecordingJob,
         rig: Rig,
         hello: Mapping[str, object] | None,
         memory: Callable[[Rig], ParameterChange | None],
@@ -271,45 +267,45 @@ class Recorder:
         try:
             bag = self._open(rig, hello)
         except Exception as error:
-            self._reject(take, error)
+            self._reject(job, error)
             return
-        take.folder = bag.folder
+        job.folder = bag.folder
         thread = threading.current_thread()
 
         def attach() -> None:
             with self._lock:
-                if self._opening is not take:
+                if self._opening is not job:
                     return
                 first = memory(rig)
                 if first is not None:
-                    take.queue.put(first)
-                self._writing[take] = thread
-                take.dropped_before = take.dropped_until = self._dropped_samples()
-                self._opening, self._take, take.attached, self.failure = None, take, True, ''
+                    job.queue.put(first)
+                self._writing[job] = thread
+                job.dropped_before = job.dropped_until = self._dropped_samples()
+                self._opening, self._job, job.attached, self.failure = None, job, True, ''
 
         try:
             self._between_blocks(attach)
         except Exception as error:
-            self._reject(take, error)
-        if not take.attached:
+            self._reject(job, error)
+        if not job.attached:
             with contextlib.suppress(OSError, RecordingError):
                 bag.discard()
             return
-        take.opened.set_result(bag.folder)
-        why = self._record(take, bag)
-        del self._writing[take]
+        job.opened.set_result(bag.folder)
+        why = self._record(job, bag)
+        del self._writing[job]
         if not why:
-            take.closed.set_result(bag.folder)
+            job.closed.set_result(bag.folder)
             return
         self._end_early(bag.folder, why)
         self._log(f'recording stopped: {why}', ERROR)
-        take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
+        job.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
         config = rig.acquisition
         with self._naming:
             folder = new_folder(Path(config.bag_dir).expanduser())
-            missing = missing_room(_nearest(folder), config.disk_reserve)
+            missing = why_full(_nearest(folder), config.disk_reserve)
             if missing:
                 raise RecordingError(f'{folder}: {missing}; make room, or {ELSEWHERE}')
             try:
@@ -325,34 +321,33 @@ class Recorder:
             except RecordingError as error:
                 raise RecordingError(f'{error}; {ELSEWHERE}') from None
 
-    def _reject(self, take: RecordingJob, error: Exception) -> None:
-        """Resolve ``take.opened`` with an error, unless it is resolved already."""
+    def _reject(self, job: RecordingJob, error: Exception) -> None:
+        """Resolve ``job.opened`` with an error, unless it is resolved already."""
         with self._lock:
-            if self._opening is not take:
+            if self._opening is not job:
                 return
             self._opening = None
-        take.opened.set_exception(error)
+        job.opened.set_exception(error)
 
-    def _record(self, take: RecordingJob, bag: BagWriter) -> str:
+    def _record(self, job: RecordingJob, bag: BagWriter) -> str:
         """Write until the end, and close; return '' or why the recording ended early."""
         try:
             try:
                 try:
-                    self._write(bag, take)
+                    self._write(bag, job)
                 finally:
-                    # Before waiting for the disk again: a new start must not be told that this
-                    # recording runs.
+                    # Before the slow close: a new start must not get this recording's future.
                     with self._lock:
-                        if self._take is take:
-                            self._take = None
+                        if self._job is job:
+                            self._job = None
             except _FullError as error:
                 # The reserve leaves room for index and summary.
                 bag.close()
                 return f'{bag.folder}: {error}; it is complete up to here'
-            _look_for(bag)
-            samples = take.dropped_until - take.dropped_before
-            if samples or take.dropped_messages:
-                bag.note_dropped(samples, take.dropped_messages)
+            _require_in_place(bag)
+            samples = job.dropped_until - job.dropped_before
+            if samples or job.dropped_messages:
+                bag.note_dropped(samples, job.dropped_messages)
             bag.close()
         except _GoneError as error:
             with contextlib.suppress(RecordingError):
@@ -369,41 +364,41 @@ class Recorder:
             return f'{bag.folder}: {type(error).__name__}: {error}'
         return ''
 
-    def _write(self, bag: BagWriter, take: RecordingJob) -> None:
-        items, config = take.queue, take.config
-        since_look = 0
-        unwritten = buffered = False
+    def _write(self, bag: BagWriter, job: RecordingJob) -> None:
+        items, config = job.queue, job.config
+        since_check = 0
+        unflushed = draining = False
         while True:
-            take.beat = time.monotonic()
+            job.beat = time.monotonic()
             try:
-                item = items.get_nowait() if buffered else items.get(timeout=IDLE_S)
+                item = items.get_nowait() if draining else items.get(timeout=IDLE_S)
             except queue.Empty:
-                if buffered:
+                if draining:
                     time.sleep(GATHER_S)
-                elif unwritten:
+                elif unflushed:
                     bag.flush()
-                    unwritten = False
-                buffered = False
+                    unflushed = False
+                draining = False
                 continue
-            buffered = True
+            draining = True
             if item is None:
                 return
             if isinstance(item, ParameterChange):
                 bag.put(item)
             else:
                 bag.write_encoded(*item)
-                take.budget.give_back(len(item[2]) + MESSAGE_BYTES)
+                job.budget.give_back(len(item[2]) + MESSAGE_BYTES)
                 with self._lock:
                     self.written += 1
-            unwritten = True
-            since_look += 1
-            if since_look >= LOOK_EVERY:
-                since_look = 0
-                _look_for(bag)
+            unflushed = True
+            since_check += 1
+            if since_check >= CHECK_EVERY:
+                since_check = 0
+                _require_in_place(bag)
                 self._make_room(bag, config)
 
     def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:
-        while missing := missing_room(bag.folder, config.disk_reserve):
+        while missing := why_full(bag.folder, config.disk_reserve):
             if config.disk_full != 'delete_oldest':
                 raise _FullError(missing)
             deleted = bag.drop_oldest()
@@ -413,7 +408,7 @@ class Recorder:
             self._log(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)', WARNING)
 
 
-def _look_for(bag: BagWriter) -> None:
+def _require_in_place(bag: BagWriter) -> None:
     if not bag.in_place:
         raise _GoneError(f'{bag.path}: was deleted or moved while it was recorded; start another recording')
 
@@ -423,12 +418,12 @@ def _nearest(folder: Path) -> Path:
     return next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path('/'))
 
 
-def missing_room(folder: Path, reserve: int) -> str:
+def why_full(folder: Path, reserve: int) -> str:
     """Why the disk of ``folder`` is too full (less than ``reserve`` bytes left); '' if it is not."""
     try:
         free = shutil.disk_usage(folder).free
     except OSError:
-        # A disk that does not tell its free space is written to until it rejects.
+        # The free space is not known: messages are written until a write fails.
         return ''
     if free >= reserve:
         return ''

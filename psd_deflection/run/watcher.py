@@ -24,7 +24,7 @@ from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import AppliedLoad, DiagnosticEntry, ParameterChange, Record, SampleBlock
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.alarm_out import AlarmOut
-from psd_deflection.run.recorder import missing_room, new_folder
+from psd_deflection.run.recorder import new_folder, why_full
 
 SEGMENT_NS = 30_000_000_000
 AFTER_NS = 60_000_000_000
@@ -216,7 +216,7 @@ class Watcher:
         if self._parent is None or not segments:
             raise RecordingError('no block has come since the last alarm was kept')
         folder = new_folder(self._parent, STEM)
-        if missing := missing_room(folder, self._config.disk_reserve):
+        if missing := why_full(folder, self._config.disk_reserve):
             raise RecordingError(f'{folder}: {missing}; make room, or name another folder (parameter watch_dir)')
         first = segments[0]
         bag = BagWriter(folder, rig_values=first.rig.flat(), device_hello=self._hello, node=self._node)

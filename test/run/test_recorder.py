@@ -84,10 +84,10 @@ def rig_for(tmp_path: Path, **changes: object) -> Rig:
 
 def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, disk: Disk) -> None:
     run = Run(rig_for(tmp_path, disk_reserve=200 * MB))
-    run.put(module.LOOK_EVERY)
+    run.put(module.CHECK_EVERY)
     assert disk.asked.acquire(timeout=WAIT_S)
     disk.free = 150 * MB
-    run.put(2 * module.LOOK_EVERY)
+    run.put(2 * module.CHECK_EVERY)
     text = run.heard()
     assert 'the disk has 150 MB left, less than disk_reserve = 200 MB; it is complete up to here' in text
     assert text.count('\n') == 0
@@ -113,7 +113,7 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
         shutil.rmtree(run.folder)
     else:
         run.folder.rename(tmp_path / 'elsewhere')
-    run.put(module.LOOK_EVERY)
+    run.put(module.CHECK_EVERY)
     text = run.heard()
     assert '_0.mcap: was deleted or moved while it was recorded; start another recording' in text
     assert run.recorder.failure in text
@@ -135,7 +135,7 @@ def test_nothing_is_written_through_link_at_folder(tmp_path: Path, noticed: str)
     (target / 'metadata.yaml').write_text('theirs')
     run.folder.symlink_to(target)
     if noticed == 'while it runs':
-        run.put(module.LOOK_EVERY)
+        run.put(module.CHECK_EVERY)
     else:
         # It is told of no recording that is not there.
         assert run.recorder.close() is None
@@ -180,22 +180,22 @@ def test_the_oldest_file_is_deleted_where_that_was_asked_for(
     mine.write_text('not of this recording')
     rig = rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest', bag_max_duration=1.0)
     run = Run(rig)
-    run.put(module.LOOK_EVERY - 1)
+    run.put(module.CHECK_EVERY - 1)
     disk.free = 150 * MB
     run.put(1)
     assert 'deleted, the disk has 150 MB left' in run.heard()
     assert run.stop() == run.folder
     assert run.recorder.files_deleted == 1
     assert mine.exists()
-    assert run.indices() == list(range(50, module.LOOK_EVERY))
+    assert run.indices() == list(range(50, module.CHECK_EVERY))
     with Reader(run.folder) as reader:
-        assert reader.message_count == module.LOOK_EVERY - 50 + len(list(run.folder.glob('*.mcap')))
+        assert reader.message_count == module.CHECK_EVERY - 50 + len(list(run.folder.glob('*.mcap')))
 
 
 def test_with_nothing_to_delete_it_ends(tmp_path: Path, disk: Disk) -> None:
     run = Run(rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest'))
     disk.free = 150 * MB
-    run.put(module.LOOK_EVERY)
+    run.put(module.CHECK_EVERY)
     assert 'no older file of this recording' in run.heard()
 
 
@@ -223,7 +223,7 @@ def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch
         go_on.wait()
         fsync(fd)
 
-    limit = 2 * module.MESSAGES_PER_BLOCK
+    limit = 2 * module.QUEUED_PER_BLOCK
     run = Run(rig_for(tmp_path), queue_blocks=2)
     monkeypatch.setattr(os, 'fsync', slow)
     run.put(1)

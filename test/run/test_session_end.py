@@ -168,7 +168,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
     full = altered(usage, free=0)
-    monkeypatch.setattr(recorder, 'LOOK_EVERY', 20)
+    monkeypatch.setattr(recorder, 'CHECK_EVERY', 20)
     monkeypatch.setattr(shutil, 'disk_usage', lambda _: full if sent else usage)
     sent: list[SampleFrame] = []
     display = Display()
