@@ -19,7 +19,7 @@ from launch_ros.substitutions import FindPackageShare
 
 PARAMETERS: dict[str, tuple[type, str]] = {
     'port': (str, 'serial port; without one, here or in params_file: the simulated rig'),
-    'demo': (bool, 'weights hang on the simulated rig in turn; false: it hangs annotated loads'),
+    'demo': (bool, 'weights hang on the simulated rig in turn; false: annotated loads are applied to it'),
     'source': (str, 'protocol of the device (psd-deflection devices --help)'),
     'solver': (str, 'solver whose answer is /link_tip/deflection (ros2 param describe NODE solver)'),
     'autostart': (bool, 'configure and activate at start; false: wait for lifecycle transitions'),

@@ -47,7 +47,7 @@ class AcquisitionConfig:
     )
     autostart: bool = parameter(True, '', 'configure and activate at start; false: wait for lifecycle transitions')
     demo: bool = parameter(
-        False, '', 'without a port: weights hang on the simulated rig in turn; false: it hangs what is noted'
+        False, '', 'without a port: weights hang on the simulated rig in turn; false: annotated loads are applied to it'
     )
     keep_zero: bool = parameter(True, '', '~/zero holds for later runs with the same device as well')
     zero_file: str = parameter(

@@ -1,7 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""One run of the daemon, for node and command line: device, ``reader``, ``pipeline``, sinks, ``recorder`` (threads).
-Only ``recorder`` and ``zero`` wait for the disk."""
+"""One run of the daemon, for node and command line: device, sinks and threads. ``reader`` and ``pipeline`` never wait
+for the disk; ``recorder``, the zero's thread and the watcher's do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from psd_deflection.run.processing import Processing, RecordSink
 from psd_deflection.run.rate_limited_log import RateLimitedLog
 from psd_deflection.run.realtime import lock_memory
 from psd_deflection.run.recorder import Recorder
-from psd_deflection.run.session_texts import ANEW, load_text, mark_text, zero_text
+from psd_deflection.run.session_texts import RETAKE_ZERO, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.run.watcher import Watcher, WatcherSink
 from psd_deflection.run.zero_store import ZeroStore
@@ -41,10 +41,10 @@ SILENT_S = 5.0
 """Dots older than this plus two blocks are out of date."""
 
 JOIN_S = 0.5
-"""How long the end waits for a pipeline that takes none of the last blocks."""
+"""At the end, a pipeline that has taken nothing from its queue for this long is given up."""
 
 PATIENCE_S = 3.0
-"""Time limit for the last blocks at the end."""
+"""At the end, the longest time for the last blocks in all."""
 
 KEEP_S = 0.2
 """Time limit for the last zero to reach the disk at the end."""
@@ -53,20 +53,20 @@ OPEN_S = 2.0
 """How long the start waits for the disk if a recording is wanted from the start."""
 
 MARKS_A_SECOND = 10
-"""Marks that are taken within a second: more than any hand sets, and few enough for every plot."""
+"""Most marks a second: more than a person sets, and few enough for every plot."""
 
-_SIMULATED = {True: 'on which weights hang in turn', False: 'at rest: it hangs the loads that are noted'}
+_SIMULATED = {True: 'on which weights hang in turn', False: 'at rest; an annotated load is applied to it'}
 
 LONGEST_LINE = 2000
-"""Characters of a line that is said."""
+"""Characters of a log line; the rest is cut."""
 
 
 class Session:
     """Opens the device on construction. ``log`` and every function in ``listeners`` get one line for each
-    change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
-    ``load``: the known load that is held now, or None. ``rejected``: messages of other nodes that could not
-    be used, by topic, ``why_rejected``: the last one of each. ``node``: full name of the ROS node, for recordings.
-    ``unzeroed``: ``rig`` with the zero that it was given, if it has one that was taken in an earlier session.
+    change of state, from any thread. ``input_sinks`` get the record of each accepted input: loads, references,
+    temperatures, marks, accelerations of the base. ``load``: the known load that acts now, or None. ``rejected``: the
+    number of unusable input messages by topic, ``why_rejected``: the latest reason. ``node``: full name of the ROS
+    node, for recordings. ``unzeroed``: ``rig`` with the zero of its parameters, if ``rig`` has a kept one.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
     """
@@ -74,14 +74,14 @@ class Session:
     def __init__(self, rig: Rig, log: LogCallback, node: str = '', unzeroed: Rig | None = None) -> None:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
-        self._short: SamplesDroppedError | RecordingError | None = None
+        self._incomplete: SamplesDroppedError | RecordingError | None = None
         self.listeners: list[LogCallback] = [log]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
         self._zeroed_ns = 0
         self.rejected = Tally()
         self.why_rejected: BoundedMap[str, str] = BoundedMap()
-        log = self._report
+        log = self._report  # From here on to all listeners.
         self._limited_log = RateLimitedLog(log)
         self._mark_rate = RateLimit(MARKS_A_SECOND)
         check_live(rig.estimator.solver)
@@ -155,8 +155,8 @@ class Session:
         return self._simulated is not None
 
     @property
-    def hangs(self) -> bool:
-        """Whether the device is a simulated rig that hangs what is noted."""
+    def applies_loads(self) -> bool:
+        """Whether the device is our simulated rig at rest, to which noted loads are applied."""
         return self._simulated is not None and not self.rig.acquisition.demo
 
     @property
@@ -171,7 +171,7 @@ class Session:
         After :meth:`close` it is a SamplesDroppedError if samples were read and not processed, a RecordingError if
         the last recording is not whole.
         """
-        return self.processing.failed or self.acquisition.failed or self._short
+        return self.processing.failed or self.acquisition.failed or self._incomplete
 
     def responsive(self) -> bool:
         """Whether reader and pipeline completed a round lately; they do so even while the device is away."""
@@ -183,12 +183,12 @@ class Session:
 
         Waits up to ``OPEN_S`` for the disk, so that the recording has the first block. If the disk has not
         answered by then, samples flow, and the recording begins when the disk answers. Raises RecordingError
-        if the disk rejects.
+        if the recording cannot be opened.
         """
         cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
             self._report(lock_memory())
-        # The recorder comes last: publishing has priority.
+        # After the ROS publisher: publishing has priority over recording.
         self.fanout.sinks.append(self.recorder)
         if self.watcher is not None and self.watcher.keeps:
             self.fanout.sinks.append(WatcherSink(self.watcher))
@@ -201,7 +201,7 @@ class Session:
                 self._report(
                     'the disk does not answer; the recording begins when it does, samples flow meanwhile', WARNING
                 )
-                asked.add_done_callback(self._notify_rejected)
+                asked.add_done_callback(self._report_failed_start)
         self.acquisition.start()
 
     def record(self, wanted: bool) -> Future[Path | None]:
@@ -217,7 +217,7 @@ class Session:
         def notify(done: Future[Path | None]) -> None:
             if done.exception() is None and (folder := done.result()) is not None:
                 if wanted and (load := self.load) is not None:
-                    # It holds already when the recording begins.
+                    # The load acts already when the recording begins: it is recorded again.
                     self._put_load(load._replace(t_ns=max(load.t_ns, asked_ns)))
                 self._report(f'recording to {folder}' if wanted else f'recording ended: {folder}')
 
@@ -229,16 +229,16 @@ class Session:
         asked.add_done_callback(notify)
         return asked
 
-    def _notify_rejected(self, done: Future[Path | None]) -> None:
+    def _report_failed_start(self, done: Future[Path | None]) -> None:
         error = done.exception()
         if error is not None:
             self.recorder.failure = str(error)
             self._report(f'not recorded: {error}', ERROR)
 
     def take_input(self, topic: str, message: bytes) -> Record | None:
-        """Record an encoded message of another node, and show it.
+        """Record an encoded input message, act on it, and pass its record to ``input_sinks``.
 
-        Returns its record, or None if the message cannot be decoded or holds a number that is not finite.
+        Returns the record, or None if the message cannot be decoded or holds a number that is not finite.
         """
         if topic == ACCELERATION:
             return self._take_acceleration(message)
@@ -262,19 +262,19 @@ class Session:
         if record.t_ns == 0:
             record = record._replace(t_ns=self.acquisition.now_ns())
         if isinstance(record, AppliedLoad):
-            self._held(record)
+            self._set_load(record)
         for sink in self.input_sinks:
             sink.put(record)
         return record
 
-    def _held(self, load: AppliedLoad) -> None:
+    def _set_load(self, load: AppliedLoad) -> None:
         self.load = load
         if any(load[1:]) and load.t_ns < self._zeroed_ns:
             ago_s = (self.acquisition.now_ns() - self._zeroed_ns) / 1e9
-            # Once is enough of a stream of loads.
+            # It is said once for each zero, however many loads come.
             self._zeroed_ns = 0
-            self._report(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {ANEW}', WARNING)
-        if self._simulated is not None and self.hangs:
+            self._report(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {RETAKE_ZERO}', WARNING)
+        if self._simulated is not None and self.applies_loads:
             self._simulated.push(load[1:])
         if self.pipeline.motion_filter is not None:
             self.processing.later(partial(self._notify_filter, load))
@@ -287,7 +287,8 @@ class Session:
             self.processing.give([reported])
 
     def _take_acceleration(self, message: bytes) -> Record | None:
-        """Unlike the other inputs it is recorded when the pipeline has it: the filter's answer depends on that."""
+        """Unlike other inputs an acceleration is recorded once the pipeline has given it to the filter, with that time:
+        the filter's output depends on the block before it, and a replay repeats that."""
         try:
             record = accel_stamped.to_base(cdr.decode(TOPIC_TYPES[ACCELERATION], message))
         except ValueError as error:
@@ -298,15 +299,15 @@ class Session:
 
     def _accelerate(self, record: BaseAcceleration, message: bytes) -> None:
         try:
-            known_ns = self.pipeline.accelerate(record)
+            record_ns = self.pipeline.accelerate(record)
         except ValueError as error:
             self._reject(ACCELERATION, str(error))
             return
-        if known_ns is None:
+        if record_ns is None:
             return
-        self.recorder.put(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, known_ns)
+        self.recorder.put(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, record_ns)
         if self.watcher is not None:
-            self.watcher.put_message(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, known_ns)
+            self.watcher.put_message(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, record_ns)
         for sink in self.input_sinks:
             sink.put(record)
 
@@ -323,8 +324,8 @@ class Session:
         return self._take_mark(cdr.encode(TOPIC_TYPES[MARK], fields), late_s)
 
     def _take_mark(self, message: bytes, late_s: float = 0.0) -> Mark:
-        """Unlike another input it is recorded only if it can be used: it is all text. Its time is its arrival, less
-        ``late_s``."""
+        """Unlike other inputs an unusable mark is not recorded: it is nothing but untrusted text. Its time is its
+        arrival, less ``late_s``."""
         try:
             mark = string.to_mark(cdr.decode(TOPIC_TYPES[MARK], message))
             if not self._mark_rate.allows(time.monotonic()):
@@ -352,29 +353,30 @@ class Session:
         self._limited_log.log(f'rejected {topic}', f'{topic}: rejected: {why}', WARNING, time.monotonic())
 
     def settle(self) -> None:
-        """Let what was counted of rejected messages be said when it is due; to be called now and then."""
+        """Log the count of rejected messages that the rate limit has held back; to be called once a second."""
         self.processing.later(lambda: self._limited_log.settle(time.monotonic()))
 
     def note_load(
         self, fx: float, fy: float, tz: float, *, add: bool = False, ago_s: float = 0.0, late_s: float = 0.0
     ) -> AppliedLoad:
-        """Take down that this load (N, N, N m) acts at the tip, as if it had come on ``/link_tip/load``.
+        """Note that this load (N, N, N m) acts at the tip, as if it had come on ``/link_tip/load``.
 
-        ``add``: it acts beside the one that is held. ``ago_s``: for how long it has acted already; the recording has
-        that time as the stamp, and the time at which it was told as that of the message. ``late_s``: for how long the
-        request was under way; a load that was noted meanwhile comes before it. Raises ValueError if another load was
-        noted since ``ago_s``, and on a simulated rig that hangs a load when it is noted.
+        ``add``: it acts beside the present load. ``ago_s``: for how long it has acted already; the recording has that
+        time as its stamp, and the present as the time of the message. ``late_s``: for how long the request was under
+        way; the stamp is earlier by it, but later than the present load's. Raises ValueError for an ``ago_s`` before
+        the present load's time, or on a simulated rig, to which a load is applied when it is noted.
         """
-        if ago_s > 0.0 and self.hangs:
-            raise ValueError('the simulated rig hangs a load when it is noted, so no load has hung before')
+        if ago_s > 0.0 and self.applies_loads:
+            raise ValueError('the simulated rig applies a load when it is noted, so it cannot have acted before')
         now_ns = self.acquisition.now_ns()
         since_ns = now_ns - round(1e9 * ago_s)
         if self.load is not None and since_ns < self.load.t_ns and ago_s > 0.0:
             held_s = (now_ns - self.load.t_ns) / 1e9
             raise ValueError(
-                f'another load is noted since {held_s:.2f} s ago, this one would be since {ago_s:.2f} s ago'
+                f'the present load began {held_s:.2f} s ago, so this one cannot have begun {ago_s:.2f} s ago'
             )
-        if not self.hangs:
+        if not self.applies_loads:
+            # Less the delay of the request, but at least 1 ns after the present load.
             held_ns = 0 if self.load is None else self.load.t_ns
             since_ns = max(since_ns - round(1e9 * late_s), min(held_ns + 1, since_ns))
         if add and (held := self.load) is not None:
@@ -426,7 +428,7 @@ class Session:
             self._report(zero_text(self.rig))
             self._keep_zero()
             if self.load is not None and any(self.load[1:]):
-                self._report(f'the zero was taken under a load ({load_text(self.load)}): {ANEW}', WARNING)
+                self._report(f'the zero was taken under a load ({load_text(self.load)}): {RETAKE_ZERO}', WARNING)
         return taken
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
@@ -459,8 +461,8 @@ class Session:
         self.acquisition.stop()
         self._finish()
         folder = self.recorder.close()
-        if self.recorder.failure and self._short is None:
-            self._short = RecordingError(f'the recording ended early: {self.recorder.failure}')
+        if self.recorder.failure and self._incomplete is None:
+            self._incomplete = RecordingError(f'the recording ended early: {self.recorder.failure}')
         if self.watcher is not None and (left := self.watcher.close(KEEP_S)):
             self._report(f'watch: {left}', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):
@@ -472,11 +474,11 @@ class Session:
     def _finish(self) -> None:
         """Let the pipeline process what was read; give up what it cannot, and say how much, and why."""
         until = time.monotonic() + PATIENCE_S
-        waits = self.acquisition.queue.qsize()
+        queued = self.acquisition.queue.qsize()
         self.processing.join(JOIN_S)
         while self.processing.alive and time.monotonic() < until:
-            before, waits = waits, self.acquisition.queue.qsize()
-            if waits >= before:
+            before, queued = queued, self.acquisition.queue.qsize()
+            if queued >= before:
                 break
             self.processing.join(JOIN_S)
         counters = self.acquisition.counters
@@ -491,7 +493,7 @@ class Session:
                 self._report(f'{self.processing.lag_reason()}: the last block is not waited for', WARNING)
         self.processing.dropped_before = counters.dropped_here
         if counters.dropped_here:
-            self._short = SamplesDroppedError(
+            self._incomplete = SamplesDroppedError(
                 f'{counters.dropped_here} samples were read and not processed ({counters.queue_dropped} while it ran, '
                 f'{counters.abandoned} at the end): {counters.dropped_why}'
             )

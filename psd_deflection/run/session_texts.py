@@ -8,7 +8,7 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import AppliedLoad, Mark
 from psd_deflection.rig.config import Rig
 
-ANEW = 'take the zero anew without load, or estimates will be of what was added to it'
+RETAKE_ZERO = 'take the zero again without load; until then estimates count from the loaded state'
 
 
 def zero_text(rig: Rig) -> str:

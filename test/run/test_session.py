@@ -80,7 +80,7 @@ def test_a_zero_that_was_taken_under_a_load_is_reported(running: Running) -> Non
     session = running.session
     session.note_load(0.0, -10.0, 0.0)
     assert session.zero() is not None
-    running.heard('the zero was taken under a load (load noted: Fx 0 N, Fy -10 N, Tz 0 N·m): take the zero anew')
+    running.heard('the zero was taken under a load (load noted: Fx 0 N, Fy -10 N, Tz 0 N·m): take the zero again')
     # A minute ago it had hung as well: before the zero. Without a load there is nothing to tell.
     session.load = None
     session.note_load(0.0, -20.0, 0.0, ago_s=60.0)
@@ -92,7 +92,7 @@ def test_a_zero_that_was_taken_under_a_load_is_reported(running: Running) -> Non
     reported = []
     while 'rejected: the end' not in (text := running.logged.get(timeout=WAIT_S)):
         reported.append(text)
-    assert not [text for text in reported if 'anew' in text]
+    assert not [text for text in reported if 'zero again' in text]
 
 
 def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> None:
@@ -168,7 +168,9 @@ def test_past_load_is_stamped_with_its_own_time(running: Running, device: Script
     first = session.note_load(0.0, -10.0, 0.0, ago_s=5.0)
     running.heard('Fy -10 N, Tz 0 N·m, since 5.00 s ago')
     assert 0 <= first.t_ns - (asked_ns - 5_000_000_000) < session.acquisition.now_ns() - asked_ns + 1
-    with pytest.raises(ValueError, match=r'another load is noted since 5\.\d\d s ago, this one would be since 9\.00 s'):
+    with pytest.raises(
+        ValueError, match=r'the present load began 5\.\d\d s ago, so this one cannot have begun 9\.00 s'
+    ):
         session.note_load(0.0, -20.0, 0.0, ago_s=9.0)
     assert session.load == first
     # From the page, as far as the daemon knows when the dots moved.
@@ -176,7 +178,7 @@ def test_past_load_is_stamped_with_its_own_time(running: Running, device: Script
     assert shown.step() == ''
     with pytest.raises(RejectedError, match='not noted: the dots have not stepped in the last 60 s'):
         shown.load(0.0, -20.0, 0.0, False, None, 0.0)
-    with pytest.raises(RejectedError, match='not noted: another load is noted'):
+    with pytest.raises(RejectedError, match='not noted: the present load began'):
         shown.load(0.0, -20.0, 0.0, False, 9.0, 0.0)
     device.send_frames(*(sample(seq) for seq in range(200, 300)))
     assert session.record(False).result(WAIT_S) == folder

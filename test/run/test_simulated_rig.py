@@ -53,7 +53,7 @@ def running(**parameters: object) -> tuple[Session, Observed]:
 def test_it_hangs_what_is_noted() -> None:
     session, observed = running()
     try:
-        assert session.hangs
+        assert session.applies_loads
         observed.until(lambda dy: max(map(abs, dy)) < 2e-6)
         # Zero gives zero: no weight hangs there when it is taken.
         assert session.zero() is not None
@@ -62,7 +62,7 @@ def test_it_hangs_what_is_noted() -> None:
         assert sag == pytest.approx(-445.43e-6, abs=0.01e-6)
         session.note_load(0.0, -10.0, 0.0)
         observed.until(lambda dy: max(abs(value - sag) for value in dy) < 3e-6)
-        with pytest.raises(ValueError, match='the simulated rig hangs a load when it is noted'):
+        with pytest.raises(ValueError, match='the simulated rig applies a load when it is noted'):
             session.note_load(0.0, -20.0, 0.0, ago_s=1.0)
         session.note_load(0.0, 0.0, 0.0)
         observed.until(lambda dy: max(map(abs, dy)) < 3e-6)
@@ -75,7 +75,7 @@ def test_it_hangs_what_is_noted() -> None:
 def test_on_the_demo_weights_hang_in_turn() -> None:
     session, observed = running(demo=True)
     try:
-        assert not session.hangs
+        assert not session.applies_loads
         observed.until(lambda dy: min(dy) < -200e-6)
     finally:
         session.close()
