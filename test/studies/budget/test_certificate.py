@@ -157,6 +157,10 @@ def test_the_scale_of_the_reference_is_that_of_each_pose(certificate: Certificat
     assert lengths.coefficients.tolist() == [[x, y, 0.0] for x, y, _ in POSES]
     assert angles.coefficients.tolist() == [[0.0, 0.0, theta] for *_, theta in POSES]
     assert (lengths.u, angles.u) == (2e-5, 1e-4)
+    # A certificate of one pose has the same inputs.
+    alone = certify(_problem(poses=POSES[1:2]))
+    assert [row.parameter for row in alone.inputs] == [row.parameter for row in certificate.inputs]
+    assert [row.u for row in alone.inputs] == [row.u for row in certificate.inputs]
     assert (lengths.unit, angles.unit, lengths.observed, angles.observed) == ('', '', False, False)
     assert (lengths.freedom, angles.freedom) == (math.inf, 8.0)
 

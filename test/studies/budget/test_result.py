@@ -64,6 +64,11 @@ def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain:
     variances = np.array([np.diag(line.covariance) for _, line in plain.budget.lines])
     bias = np.sum([line.bias for _, line in plain.budget.lines], axis=0)
     message = expanded(variances, [cause.freedom(plain.budget.at) for cause in CAUSES], bias)
+    dx, dy, theta = plain.budget.at.pose.tolist()
+    pose = (
+        f'ΔX {1e3 * dx:.4f} mm, ΔY {1e3 * dy:.4f} mm, θ {math.degrees(theta):.4f} deg; method exact; mean of 20 samples'
+    )
+    assert plain.lines()[0].endswith(pose)
     _, *rows = plain.expanded_rows()
     assert len(rows) == 5
     assert [float(v) for v in rows[0][1:]] == pytest.approx((message.standard * SCALES).tolist(), abs=6e-4)

@@ -135,6 +135,15 @@ def test_the_stop_rule_is_short_by_its_window(name: str) -> None:
     assert stopped[:2] / stopped[2] == pytest.approx(got.bias[:2] / got.bias[2], rel=0.02, abs=1e-3)
 
 
+@pytest.mark.parametrize(('share', 'short', 'sd'), [(-0.99, 0.99, 0.0), (1.01, 1.0, math.radians(0.01) / 12**0.5)])
+def test_within_the_window_of_its_stop_the_twist_is_not_seen(share: float, short: float, sd: float) -> None:
+    window = stop_window(RIG.centers, 0.1e-3)
+    got = COMPUTATION.contribution(_at_pose(np.array([1e-3, 0.0, share * window]), 'thesis_iteration'))
+    step = math.radians(0.01) if sd else 0.0
+    assert got.bias[2] == pytest.approx(-math.copysign(short * window - step / 2.0, share), rel=1e-6)
+    assert math.sqrt(got.covariance[2, 2]) == pytest.approx(sd, rel=1e-6, abs=1e-12)
+
+
 def test_shares_add_to_one_where_one_bias_stands_alone() -> None:
     budget = evaluate(_at())
     assert np.sum([budget.shares(line) for _, line in budget.lines], axis=0) == pytest.approx(1.0, abs=0.02)

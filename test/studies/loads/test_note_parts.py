@@ -380,6 +380,10 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     for apart, reported in ((249, []), (250, [3.01])):
         assert unannotated_steps(RIG, dots, annotated_at(8000, 8000 + apart)) == reported
         assert (correct_loads(RIG, dots, annotated_at(3000, 9000, 9000 + apart)) is None) == (not reported)
+    # A note is of a step from two widths before its first sample to two after its last.
+    width = 2 * round(4.0 / RIG.dynamics.bending_frequency * 1000.0)
+    for at, reported in ((2800 - width, []), (2799 - width, [3.01]), (3200 + width, []), (3201 + width, [3.01])):
+        assert unannotated_steps(RIG, dots, annotated_at(at, 8000)) == reported
     # A ramp is one change, which ends once; one that comes two samples later is another.
     ramp = annotated_at(*range(8000, 8100))
     assert unannotated_steps(RIG, dots, ramp) == [3.01]

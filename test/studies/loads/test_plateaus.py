@@ -310,6 +310,10 @@ def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
     # Off by 0.5 N rms, a tenth of the step, counted by the larger of two forces: two of four by the root of a half.
     assert rounded((0.72, 0.5, 0.0), (0.5, -0.72, 0.0))
     assert not rounded((0.70, 0.5, 0.9), (0.5, -0.70, 0.9))
+    # Forces in steps of 1 N may be, while each is off by less than that.
+    small = np.array([(1.0, -2.0, 0.0), (0.0, -3.0, 2.0), (7.0, 0.0, 0.0), (0.0, -4.0, 1.0)])
+    for off, may_be in ((0.99, True), (1.0, False)):
+        assert plateaus.may_be_rounded(observed({1: (0.0, -off, 9.0)}, small)) is may_be
 
 
 def test_loads_of_which_none_held_were_not_rounded() -> None:
