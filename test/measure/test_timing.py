@@ -294,6 +294,19 @@ def test_the_map_turns_at_the_last_stamp(by_us: int, before_us: int, last_us: in
     assert [clock.host_ns(last_us + us) for us in (0, 1000)] == [last, last + MS - 2000]
 
 
+def test_a_clock_whose_jump_is_known_goes_on_as_one_without() -> None:
+    plain, jumped = ClockMap(), ClockMap()
+    for second in range(20):
+        us, host = 1_000_000 * second, 1001 * MS * second
+        by_us = 700_000 if second > 14 else 0
+        if second == 15:
+            jumped.shift(by_us, us - 1)
+        plain.observe(us, host)
+        jumped.observe(us + by_us, host)
+        assert jumped.host_ns(us + by_us) == plain.host_ns(us)
+        assert jumped.state().skew_ppm == plain.state().skew_ppm
+
+
 def test_lower_line_is_closest_of_lines_below_points() -> None:
     rng = np.random.default_rng(8)
     for _ in range(100):
