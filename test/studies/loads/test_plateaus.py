@@ -316,6 +316,16 @@ def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
         assert plateaus.may_be_rounded(observed({1: (0.0, -off, 9.0)}, small)) is may_be
 
 
+@pytest.mark.parametrize(('annotated', 'step'), [(VARIED, 10.0), (VARIED[:5], 10.0), (VARIED / 10.0, 1.0)])
+def test_forces_may_be_rounded_if_off_by_less_than_a_step(annotated: FloatArray, step: float) -> None:
+    for off, may in ((0.999, True), (-0.999, True), (1.001, False), (-1.001, False)):
+        assert plateaus.may_be_rounded(observed({2: (0.0, off * step, 2.0 * step)}, annotated)) is may
+    assert not plateaus.may_be_rounded(observed({}, annotated[:4]))
+    # Multiples of no step, and torques alone.
+    assert not plateaus.may_be_rounded(observed({}, annotated + 0.3))
+    assert not plateaus.may_be_rounded(observed({}, annotated * (0.0, 0.0, 1.0) + (0.0, 0.0, step)))
+
+
 def test_loads_of_which_none_held_were_not_rounded() -> None:
     """As those of a sweep."""
     none = np.zeros((0, 3))
