@@ -221,6 +221,10 @@ def test_change_counts_above_three_times_allowed_effects() -> None:
     assert (found.first, found.last, found.changes) == (2000, 8000, 3)
     assert found.value == found.size == pytest.approx(0.3)
     assert unannotated_times(asked([0.0, 1.4, 0.0, 1.4], alone=1), 20_000, 0.001) == []
+    # Where nobody knows any load there is nothing left to compare.
+    of = asked([0.0, 1.6, 0.0, 1.6], alone=1)
+    known = [dataclasses.replace(p, annotated=np.zeros(3)) if i in (0, 4) else p for i, p in enumerate(of.plateaus)]
+    assert unannotated_times(dataclasses.replace(of, plateaus=tuple(known)), 20_000, 0.001) == []
 
 
 def test_two_changes_are_too_few_and_noted_ones_do_not_count() -> None:
