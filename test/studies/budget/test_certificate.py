@@ -165,12 +165,6 @@ def test_the_scale_of_the_reference_is_that_of_each_pose(certificate: Certificat
     assert (lengths.freedom, angles.freedom) == (math.inf, 8.0)
 
 
-def test_a_pose_is_stated_without_the_others(certificate: Certificate) -> None:
-    for pose, stated in zip(POSES, certificate.stated, strict=True):
-        (alone,) = certify(_problem(poses=[pose])).stated
-        assert alone.uncertainty == pytest.approx(stated.uncertainty, rel=1e-9)
-
-
 @pytest.mark.parametrize(('doubt', 'freedom'), [(0.5, 2.0), (1.0, 0.5), (0.0, math.inf), (1e-3, 5e5)])
 def test_a_doubt_about_the_reference_is_its_degrees_of_freedom(doubt: float, freedom: float) -> None:
     inputs = read_inputs(None, {'assumption_doubt': doubt}, declared=EVERY)

@@ -310,15 +310,11 @@ def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
     # Off by 0.5 N rms, a tenth of the step, counted by the larger of two forces: two of four by the root of a half.
     assert rounded((0.72, 0.5, 0.0), (0.5, -0.72, 0.0))
     assert not rounded((0.70, 0.5, 0.9), (0.5, -0.70, 0.9))
-    # Forces in steps of 1 N may be, while each is off by less than that.
-    small = np.array([(1.0, -2.0, 0.0), (0.0, -3.0, 2.0), (7.0, 0.0, 0.0), (0.0, -4.0, 1.0)])
-    for off, may_be in ((0.99, True), (1.0, False)):
-        assert plateaus.may_be_rounded(observed({1: (0.0, -off, 9.0)}, small)) is may_be
 
 
 @pytest.mark.parametrize(('annotated', 'step'), [(VARIED, 10.0), (VARIED[:5], 10.0), (VARIED / 10.0, 1.0)])
 def test_forces_may_be_rounded_if_off_by_less_than_a_step(annotated: FloatArray, step: float) -> None:
-    for off, may in ((0.999, True), (-0.999, True), (1.001, False), (-1.001, False)):
+    for off, may in ((0.999, True), (-0.999, True), (1.0, False), (-1.0, False)):
         assert plateaus.may_be_rounded(observed({2: (0.0, off * step, 2.0 * step)}, annotated)) is may
     assert not plateaus.may_be_rounded(observed({}, annotated[:4]))
     # Multiples of no step, and torques alone.
