@@ -6,8 +6,6 @@
 names of the ROS message definitions, so that nothing here needs ROS.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/AccelStamped: acceleration of the link's base, in ``link_base``, without gravity; m/s^2 and rad/s^2."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

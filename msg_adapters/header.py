@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """std_msgs/Header: a stamp in integer nanoseconds and the frame the numbers are in."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -9,8 +9,6 @@ bytes nor hashes. The tests compare fields and hashes with an independent collec
 definitions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any

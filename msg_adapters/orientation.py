@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quaternion of the tip's rotation R = Ry(omega) Rx(phi) Rz(theta), and back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -9,8 +9,6 @@ replay has the same input as the live pipeline: ``flags`` UINT32 if a sample has
 UINT32 (seq div 2^32) once the sample number has passed 32 bits, after 49 days at 1 kHz.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/PointStamped: the block mean of one dot, in its own PSD's axes; m."""
 
-from __future__ import annotations
-
 from msg_adapters.header import Fields, header
 from msg_adapters.message_type import MessageType
 from psd_deflection.records import SpotMeans

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/PoseStamped: an estimate or a reference measurement of the tip, in ``link_tip_rest``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

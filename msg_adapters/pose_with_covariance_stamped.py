@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/PoseWithCovarianceStamped: the primary estimate, the filter's pose or a reference, with covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

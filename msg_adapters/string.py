@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """std_msgs/String: the rig as JSON, so that a recording of any recorder can be evaluated with it; and marks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Temperature: degrees Celsius; a variance of 0 says that it is not known."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/TwistStamped: the tip's velocity by the filter, in ``link_tip_rest``; m/s and rad/s."""
 
-from __future__ import annotations
-
 from msg_adapters.header import Fields, header
 from msg_adapters.message_type import MessageType
 from msg_adapters.pose_stamped import FRAME

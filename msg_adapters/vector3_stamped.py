@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/Vector3Stamped: one raw sample of one PSD as plain numbers, for plots; x, y and the sum as z, V."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from msg_adapters.header import Fields, header

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/WrenchStamped: a load at the tip centroid, in ``link_tip_rest``; N and N m."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

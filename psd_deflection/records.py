@@ -3,8 +3,6 @@
 """The records that the pipeline passes on, frozen, SI, times in integer nanoseconds: :class:`RawChunk` (counts),
 :class:`SampleBlock`, :class:`SpotMeans`, :class:`DeflectionEstimate` of each solver, :class:`TipLoad`."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ ZV and ZVD: Singer and Seering, J. Dyn. Syst. Meas. Control 112, 76 (1990). EI: 
 Japan/USA Symposium on Flexible Automation (1996). MZV: the ZV of three impulses a quarter turn apart, shorter than ZVD.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

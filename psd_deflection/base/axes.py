@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The three axes of the tip as people read them: symbols, units, and the factor from SI to what is shown."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What others can make grow has a bound here: the bytes that wait for something, the words that are remembered."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator, Mapping, MutableMapping
 from typing import TypeVar

@@ -6,8 +6,6 @@ Bars and matrices are text of the page in the page's own colours, right on dark 
 :mod:`psd_deflection.base.figures` draws each with matplotlib.
 """
 
-from __future__ import annotations
-
 import html
 import itertools
 import math

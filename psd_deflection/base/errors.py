@@ -6,8 +6,6 @@ Every message is one line: what is wrong, where, and how to fix it. Any other ex
 of this package and ends with a traceback.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 INTERRUPTED = 130

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A declared drawing as a matplotlib figure, for a file or a notebook; pages draw the same declaration themselves."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

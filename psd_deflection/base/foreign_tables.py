@@ -5,8 +5,6 @@
 Nothing is converted by itself: a reader that rejects a table says these words.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Sequence
 from pathlib import PurePath

@@ -6,8 +6,6 @@ Only plain types come out (maps, lists, text, numbers, dates), and only as much 
 of aliases or merge keys can stand for more than any memory holds, and some tags make the parser itself fail.
 """
 
-from __future__ import annotations
-
 import functools
 import io
 import math

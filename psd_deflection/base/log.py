@@ -5,8 +5,6 @@
 The severities are the numbers of :mod:`logging`, which are those of ROS too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A self-contained web page: its style, its tables, its policy and the scripts of its charts, for the reports."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html

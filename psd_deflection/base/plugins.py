@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads code of other packages: whatever it does on import, the caller gets one error that names it or its extra."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

@@ -8,8 +8,6 @@ always increases. If a device restarts, from any number, its numbers continue in
 numbers. The few numbers between belong to no sample.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import Enum
 

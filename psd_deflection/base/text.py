@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Text for people and programs: a stranger's words made printable, near spellings, plain numbers, JSON of numbers."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What one frame gives: a pose with its covariance, or the reason why there is none."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import NamedTuple
 

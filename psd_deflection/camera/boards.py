@@ -6,8 +6,6 @@ The board's middle is ``link_tip``'s origin; seen from its front, its columns ru
 by the numbers in the markers, so a board has no half turn, and may be partly hidden.
 """
 
-from __future__ import annotations
-
 import abc
 import math
 import re

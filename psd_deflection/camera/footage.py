@@ -6,8 +6,6 @@ A folder has ``frames.csv`` with ``file,t,exposure`` (s; ``t`` is the start of t
 exposure is not known: ``camera.exposure`` says it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lens from images of a ChArUco board, by OpenCV's calibration (Zhang 2000), as ROS's ``camera_info`` YAML."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenCV, imported when it is first needed: everything else of this package runs without it."""
 
-from __future__ import annotations
-
 import functools
 import os
 import re

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame with what was found in it, as a picture: where the camera looks, and why a frame has no answer."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The target on paper, to scale: PDF, SVG or PNG."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -3,8 +3,6 @@
 """From the target in each image to the tip in ``link_tip_rest``: the rest, the mean of the first good frames
 (``rest.frames``; 0: those that do not differ by more than noise), is taken off, its variance in every covariance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -11,8 +11,6 @@ The edges' directions are those of the board's first pose; place, blur across ei
 for each corner. OpenCV's ``cornerSubPix`` leaves ten times the error on the same images.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

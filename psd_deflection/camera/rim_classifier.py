@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Judges a fitted picture: rejects one that is not of the target at rest or in plain motion; else its covariance."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -5,8 +5,6 @@
 The model is that of :mod:`.rim_model`; :mod:`.rim_classifier` decides whether the fit is an answer.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

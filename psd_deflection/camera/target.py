@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A kind of target: how it is found in an image, how it is drawn on paper, and what describes it."""
 
-from __future__ import annotations
-
 import abc
 from typing import Any, ClassVar, NamedTuple
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The terminal display of a session: one live line, and messages above it."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import shlex

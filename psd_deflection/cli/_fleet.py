@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same work on each of many recordings: options, engine, progress, table, and the exit status."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

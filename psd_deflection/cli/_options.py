@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks of option values: a mistake ends with status 2, before anything is read or written."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import functools

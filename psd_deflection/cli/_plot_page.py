@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a recording: one file with its data, drawn by the scripts of the live page."""
 
-from __future__ import annotations
-
 import html
 import json
 from collections.abc import Mapping, Sequence

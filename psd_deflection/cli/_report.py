@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Columns that line up, JSON and figures on disk, for the commands that report."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import sys

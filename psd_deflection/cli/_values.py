@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of options: a mistake ends with status 2. Light, for the commands that only speak to a daemon."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import math

@@ -9,8 +9,6 @@ Save the output where your shell looks for it. For bash this is the file
   psd-deflection completion zsh
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from typing import Any

@@ -11,8 +11,6 @@ effects, and a geometry that cannot be solved, are rejected.
   psd-deflection params --params-file my_rig.yaml --json
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.cli._report import print_json, show

@@ -6,8 +6,6 @@ Another thread may end every wait for a port, also while it is opened: by :meth:
 that it was opened with. So each wait is cut into slices.
 """
 
-from __future__ import annotations
-
 import abc
 import os
 import re

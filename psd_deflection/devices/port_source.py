@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common base of the sources on one port: open it, give up, close, and reject use before the port is open."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping, Sequence
 

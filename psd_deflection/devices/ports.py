@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens a port by its name: a serial port of this machine, or a port of the network by its scheme."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import select

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pseudo-terminal: a port that pyserial can open, with one of our programs at the other end."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -11,8 +11,6 @@ A plug-in declares an entry point of the group ``psd_deflection.sources``. Its o
         my_converter = my_package.source:MyConverter
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterator
 from importlib.metadata import entry_points

@@ -3,8 +3,6 @@
 """A recording as a device, in real time (``source: replay``): samples keep their numbers, so a loss is a loss here;
 ``replay.stamps`` sets their times, ``now`` or ``recorded``."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping

@@ -3,8 +3,6 @@
 """Serves a simulated device on pseudo-terminals or on the network, in real time, as a process of its own: parameters
 come as a line of JSON, each further line is a load, and the end of its standard input ends it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import select

@@ -14,8 +14,6 @@ reader closes it and calls ``reopen`` until it succeeds, with a pause of 0.2 s b
 by any.
 """
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Mapping, Sequence
 from enum import Enum

@@ -3,8 +3,6 @@
 """Finds which device is on which port: sends the question of every device that has a probe, and listens. Nothing is
 started or set; a port that another program has open is left alone."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -3,8 +3,6 @@
 """Ports of the network: ``socket://HOST:PORT``, bytes over TCP, and ``rfc2217://HOST:PORT``, a serial port with its
 line speed over Telnet (RFC 2217, ser2net)."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import select

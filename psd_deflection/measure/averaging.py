@@ -3,8 +3,6 @@
 """Blocks of N by sequence number (``seq // block_size``: a lost sample shortens one block and shifts none), and what
 the samples of each say."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

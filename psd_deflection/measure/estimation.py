@@ -3,8 +3,6 @@
 """The dots of one block -> the estimate with its covariance: all readings, or, if their check excludes a PSD, the
 others. The state is the last twist that was measured, for ``degraded: hold``."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass

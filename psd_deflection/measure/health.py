@@ -3,8 +3,6 @@
 """Checks lasers and detectors from a block's samples before it is solved: a fault makes one detector unreliable, a
 finding is a warning. One count goes on: blocks in a row in which a detector's values did not change."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

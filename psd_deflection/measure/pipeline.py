@@ -3,8 +3,6 @@
 """From chunks of samples to records, by one class in the live run and in replay: no clock, thread or I/O, so the output
 is that of rig, samples and order of calls, bit for bit. Parts tell what they remember (:mod:`.state`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 

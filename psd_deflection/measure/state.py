@@ -3,8 +3,6 @@
 """State of the pipeline's parts from block to block, as numbers by name: recorded, so that a replay goes on with the
 same bits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 

@@ -23,8 +23,6 @@ device's clock itself jumped (a restart, a step) does the map start again; such 
 sample numbers reveal shifts the map by as much (:meth:`ClockMap.shift`), and what it has learnt stays.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import NamedTuple
 

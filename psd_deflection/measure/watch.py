@@ -16,8 +16,6 @@ people note a load after they have put it on. The object owns no clock and no th
 alarms, live and in replay.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import statistics

@@ -3,8 +3,6 @@
 """Message field dicts to CDR (XCDR1, little-endian) and back, by coders made from the message definitions; headers and
 numbers in one step."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recording shows over time, declared: its samples, and a series of estimates."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording whose samples are in memory: simulated, or read by a format of another package."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 

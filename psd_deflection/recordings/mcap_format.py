@@ -6,8 +6,6 @@ The format: https://mcap.dev/spec. A record is ``opcode u8 | length u64 | conten
 length inside a record is compared with the record before it is used.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from enum import IntEnum

@@ -5,8 +5,6 @@
 A recording keeps it, so that ``replay --compare`` can say why bits differ.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import sys

@@ -3,8 +3,6 @@
 """Repairs a recording that ends in a crash: every intact message is copied into a new file with index and summary, and
 only then the old one is renamed to ``NAME.mcap.cut``. A failed repair loses nothing."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Mapping

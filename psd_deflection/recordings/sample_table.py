@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The samples of a recording as an array, and as a table with what was recorded beside them."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path

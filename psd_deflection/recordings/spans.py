@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A part of a recording: from when and up to when, in the words of a person."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is in a recording, in numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

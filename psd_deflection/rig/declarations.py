@@ -4,8 +4,6 @@
 params``, the node's descriptors and the documentation are derived; how the node runs is in
 :mod:`psd_deflection.rig.running`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

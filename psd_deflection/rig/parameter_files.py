@@ -5,8 +5,6 @@
 What a file says comes out as flat values (``link.length``); :mod:`psd_deflection.rig.config` checks them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -14,8 +14,6 @@ The parameter files, the command line, the node and the documentation read what 
 :mod:`psd_deflection.rig.declarations` declare. :func:`check_value` is the one place that validates a value.
 """
 
-from __future__ import annotations
-
 import math
 import reprlib
 import typing

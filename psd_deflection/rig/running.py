@@ -6,8 +6,6 @@ They describe no rig; those that do, and the table of all, are in
 :mod:`psd_deflection.rig.declarations`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from psd_deflection.rig.parameters import parameter

@@ -3,8 +3,6 @@
 """The node ``camera``: images (raw or compressed) in, ``/reference/deflection`` with covariance out, and why frames are
 rejected. Of the frames that come while one is measured, all but the last are dropped."""
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import math

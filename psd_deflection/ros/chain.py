@@ -3,8 +3,6 @@
 """The node ``chain``: several rigs in one process, their topics below each link's name, and the end effector composed
 of them, with all frames on ``/tf``. ``~/zero`` and ``~/record`` act on every link."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace

@@ -18,8 +18,6 @@ zero. If that takes longer than ``RELEASE_S``, the node is not deactivated: the 
 says which offset is left. Offsets that stay with a controller that tells nothing are said, too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

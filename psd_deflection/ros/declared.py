@@ -6,8 +6,6 @@ A section of :mod:`psd_deflection.rig.parameters` declares them, once, for the c
 ``-p NAME:=VALUE`` or ``--params-file`` has the last word.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 

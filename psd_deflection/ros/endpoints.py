@@ -3,8 +3,6 @@
 """Makes publishers from the rows of :mod:`psd_deflection.ros.topics`, and what subscriptions need
 of a row."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import time

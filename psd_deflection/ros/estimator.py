@@ -4,8 +4,6 @@
 publishes too, from the pipeline's own thread. The executor serves parameters, services, inputs and the 1 Hz
 diagnostics."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -3,8 +3,6 @@
 """Goals of FollowJointTrajectory, passed on with shaped trajectories, one after the other; what the controller says is
 what the sender hears. Nothing waits: no answer ends a goal after a bounded time, with the reason."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

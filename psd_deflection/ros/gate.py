@@ -3,8 +3,6 @@
 """What other nodes send, messages and goals, comes in through one gate: bounded in size and rate, checked, and what
 cannot be used is rejected, counted and said once. No message ends a node."""
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 """Markers for RViz: link, plate, detectors, beams and dots, displacements magnified. Static parts are latched; moving
 ones go when there is no estimate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """rclpy from its start to its end, for every node that runs until a signal stops it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -3,8 +3,6 @@
 """The node ``shaper``: joint trajectories (``~/trajectory``, or goals of ``action``) in, the same shaped out, so that
 they do not ring the link. What cannot be followed is rejected with the reason."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any

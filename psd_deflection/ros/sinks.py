@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Connects a session to the graph: publishers of encoded messages, recorded subscriptions, services, transforms."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import time

@@ -3,8 +3,6 @@
 """Every topic of the nodes, a row each (:data:`PUBLISHED`, :data:`HEARD`, :data:`SERVED`), from which publishers,
 subscriptions, actions and ``docs/topics.md`` are made; names of frames and services. It needs no rclpy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 

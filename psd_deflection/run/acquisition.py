@@ -3,8 +3,6 @@
 """The reader thread owns source, sequence numbers and clock, and puts chunks with host times on a bounded queue, each
 as soon as its block is complete. It never waits; every missing sample is counted once, under its cause."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import threading

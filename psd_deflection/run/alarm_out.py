@@ -3,8 +3,6 @@
 """Hands each alarm of the watch to a command and to a web address, as one JSON object: in a thread of its own, bounded
 in time and number. What fails is said once and counted."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import queue

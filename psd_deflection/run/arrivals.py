@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the reader puts on its queue, the samples that wait to be put there, and counters of what was sent or lost."""
 
-from __future__ import annotations
-
 import queue
 from dataclasses import dataclass, field
 from typing import NamedTuple

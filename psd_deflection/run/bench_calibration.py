@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrates at the bench: computes the calibration again and again from a recording that is still being written."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -6,8 +6,6 @@ It reads no clock: every time comes from the caller. Times of samples are device
 CLOCK_MONOTONIC nanoseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from psd_deflection.base.sequence import NEARBY, WRAP

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of the run in numbers, once a second, for ``/diagnostics`` and for the terminal."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from msg_adapters import ACCELERATION

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encodes each record once and hands the bytes to every wire: ROS publishers and the recorder."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from msg_adapters import (

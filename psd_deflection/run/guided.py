@@ -3,8 +3,6 @@
 """A guided check of a live rig: reads the device while a person (or the simulated hand) pushes the
 tip."""
 
-from __future__ import annotations
-
 import queue
 from collections.abc import Callable
 

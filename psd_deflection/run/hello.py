@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gate for what a device says of itself, and the pinger that asks for its time now and then."""
 
-from __future__ import annotations
-
 import random
 
 from psd_deflection.base.errors import DeviceError

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """When the link moved last, by the dots of the last minute: a weight is noted after it was hung."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -3,8 +3,6 @@
 """The pipeline thread: takes chunks off the queue and gives records to the sinks. Requests of other threads run between
 two blocks and must not wait for anything."""
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lines that may come again and again, said at once and then ever more seldom, with a count."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 

@@ -3,8 +3,6 @@
 """What a process requests from the system: locked memory, real-time priority for the reader, a watchdog
 (``docs/deploy``); what the system asks of it: signals; and why a thread does not keep up."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

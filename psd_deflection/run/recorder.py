@@ -3,8 +3,6 @@
 """The recorder thread writes the published messages to a bag without delaying the pipeline. Messages pass through a
 bounded queue; those that do not fit are counted. A disk error or too little room ends the recording, never the run."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import shutil

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tells a wire what the rig is, and what the pipeline remembers: ``/link_tip/rig``."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -3,8 +3,6 @@
 """One run of the daemon, for node and command line: device, sinks and threads. ``reader`` and ``pipeline`` never wait
 for the disk; ``recorder``, the zero's thread and the watcher's do."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a session says of its zero, its loads and its marks, a line each: the same from page, command and node."""
 
-from __future__ import annotations
-
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import AppliedLoad, Mark
 from psd_deflection.rig.config import Rig

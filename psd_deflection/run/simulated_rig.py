@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts the simulated rig as a separate process, like a real device."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import select

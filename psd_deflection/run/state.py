@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where programs keep what outlives a run: a folder of the user, and files named by the device's serial number."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

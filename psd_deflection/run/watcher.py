@@ -3,8 +3,6 @@
 """The watch in a run: the last minutes are kept encoded in memory, bounded in bytes and time, each segment with the rig
 and the pipeline's memory; an alarm writes them below ``watch_dir``, in a thread of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -3,8 +3,6 @@
 """Keeps the unloaded dots of the last ``~/zero``, a small file per device (or ``zero_file``), with the rig file's zero
 of that time: once that changes, the kept one is ignored. A bad file is ignored with a line in the log."""
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path

@@ -3,8 +3,6 @@
 """Two lasers over one beam splitter (thesis 5.4), one half of their beam for each PSD: together at most twice the power
 of one PSD; half of one is enough for both; the second may be a cold spare. What a failure does is simulated."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

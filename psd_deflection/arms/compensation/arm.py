@@ -5,8 +5,6 @@
 Pinocchio would do the same. Its wheels take 0.35 GB with what they bring along, for one product of matrices a joint.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

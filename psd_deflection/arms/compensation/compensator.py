@@ -21,8 +21,6 @@ What a controller tells is where the offsets begin, and never how well they do: 
 the joints' positions (:class:`JointResponse`) and the deflection.
 """
 
-from __future__ import annotations
-
 import math
 from enum import StrEnum
 from typing import NamedTuple

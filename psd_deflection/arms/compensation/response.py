@@ -4,8 +4,6 @@
 is 1 if the controller adds them. Its half-width is what could be wrong at worst. Two motions in a row must say that s
 is wrong: the load may have changed in one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a robot runs, by what its drivers and controllers tell: the offsets of one that does not run hold."""
 
-from __future__ import annotations
-
 LEAST_SPEED = 1e-3
 """A speed scaling below it is a stop. Drivers tell shares or per cent."""
 SILENT_S = 0.5

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The settings of the compensator, and those of the shaper of joint trajectories with the shaper that they make."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from psd_deflection.arms.compensation.arm import read_limits

@@ -15,8 +15,6 @@ order is numpy's affair. Its Fourier transform is compiled with multiply-adds on
 Functions with ``_many`` take arrays, the others floats.
 """
 
-from __future__ import annotations
-
 from psd_deflection.base.arithmetic.fixed import FixedArithmetic
 from psd_deflection.base.arithmetic.library import Arithmetic
 from psd_deflection.base.arithmetic.matrices import in_pairs

@@ -4,8 +4,6 @@
 exponential and logarithm by + - * / and square roots (Muller, Elementary Functions, 2016, chapters 3 and 11), right to
 about one unit in the last place for angles up to 10^6 rad and exponents above -700. ``_many`` take arrays."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from math import factorial, fmod, ldexp, sqrt

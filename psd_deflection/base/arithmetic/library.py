@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arithmetic of numpy and the C library."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sums and eliminations of small matrices, each in an order that stands here."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 from functools import cache

@@ -5,8 +5,6 @@
 The transforms of numpy are compiled with multiply-adds where the processor has them (aarch64), and round differently.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

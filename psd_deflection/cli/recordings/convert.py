@@ -13,8 +13,6 @@ estimates, dots, loads and losses with a layout, and cannot be read back.
   psd-deflection convert bags/clean --out part.csv --from 1 --to 2.5
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

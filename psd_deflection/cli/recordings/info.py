@@ -10,8 +10,6 @@ a pattern, or a .txt file that lists recordings and patterns. A table of reading
   psd-deflection info 'recordings/*' --executor processes --out all.parquet
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -11,8 +11,6 @@ loads, references, marks and zeros of the recording are drawn too. The ending of
   psd-deflection plot run.csv --params-file my_rig.yaml --out run.html
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections import Counter

@@ -11,8 +11,6 @@ written is rejected.
   psd-deflection recover lone.mcap
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from typing import Any

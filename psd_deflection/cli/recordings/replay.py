@@ -20,8 +20,6 @@ Then --out X.parquet takes the estimates of all.
   psd-deflection replay 'recordings/*' --executor processes --out all.parquet
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import time

@@ -16,8 +16,6 @@ given, and the true pose with --true-pose or, with noise, --reference-noise. A .
   psd-deflection simulate --serve socket://127.0.0.1:4000
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import shlex

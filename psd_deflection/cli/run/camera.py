@@ -18,8 +18,6 @@ bag folder have /reference/deflection and /reference/deflection_with_covariance.
   ros2 run psd_deflection camera --ros-args -r image:=/camera/image_raw
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib.util

@@ -14,8 +14,6 @@ the end effector has none.
   ros2 run psd_deflection chain --ros-args -p chain:=my_arm.yaml -p record:=true
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import queue

@@ -16,8 +16,6 @@ Each option is a ROS parameter, too.
 docs/compensation.md describes it.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.arms.compensation.arm import NO_TIP, read_arm

@@ -11,8 +11,6 @@ use or cannot be opened.
   psd-deflection devices /dev/ttyACM0 --json
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Sequence

@@ -17,8 +17,6 @@ While it runs:
   ros2 service call /estimator/record std_srvs/srv/SetBool "{data: true}"
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 

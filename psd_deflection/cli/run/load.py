@@ -17,8 +17,6 @@ With ROS: ros2 topic pub --once /link_tip/load geometry_msgs/msg/WrenchStamped
           "{header: auto, wrench: {force: {y: -10.0}}}"
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.cli._daemon import request, url_option

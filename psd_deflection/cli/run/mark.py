@@ -11,8 +11,6 @@ them, and they bound a part of it (--from 'mark:bumped the table'). The daemon m
 With ROS: ros2 topic pub --once /link_tip/mark std_msgs/msg/String "{data: bumped the table}"
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.cli._daemon import request, url_option

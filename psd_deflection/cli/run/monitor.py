@@ -17,8 +17,6 @@ token. Ctrl-C ends it.
 The node serves the same page: estimator --monitor, or the parameter monitor:=true.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import signal

@@ -12,8 +12,6 @@ folder is printed.
 With ROS: ros2 service call /estimator/record std_srvs/srv/SetBool "{data: true}"
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.cli._daemon import request, url_option

@@ -15,8 +15,6 @@ parameter, too. With --action it does the same for goals of FollowJointTrajector
 docs/shaping.md describes it.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.arms.compensation.settings import SHAPING, trajectory_shaper

@@ -13,8 +13,6 @@ the command waits until it rests, 10 s at most.
 With ROS: ros2 service call /estimator/zero std_srvs/srv/Trigger
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 

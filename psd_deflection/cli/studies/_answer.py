@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every study's command does with its result: print it, or its JSON, and write its files."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable
 from types import SimpleNamespace

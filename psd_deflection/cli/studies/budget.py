@@ -14,8 +14,6 @@ Inputs that are not in the rig file have defaults (--explain lists them with the
 with --set NAME=VALUE, or keep them in a YAML file of NAME: VALUE lines (--inputs).
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import math

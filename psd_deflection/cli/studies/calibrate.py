@@ -29,8 +29,6 @@ row. REC may then be a pattern, or a .txt file that lists recordings and pattern
   psd-deflection calibrate 'archive/*' --each --out calibrations.parquet
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping, Sequence

@@ -16,8 +16,6 @@ certificate and names are fields: --fields takes a YAML file of NAME: WORDS line
   psd-deflection certificate calibrated --out c --limit 5e-5 5e-5 1e-3
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

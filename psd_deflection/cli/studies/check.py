@@ -19,8 +19,6 @@ For a recording: a second of rest, then a load along X alone, one along Y alone,
 seconds, noted as load_fx, load_fy, load_tz (CSV) or on /link_tip/load (bag). Ten times the noise is enough.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 

@@ -14,8 +14,6 @@ three rules of the thesis (5.4), and simulates the failure of one, with the othe
   psd-deflection design --splitter 1e-3 1e-3 --allowed 1e-3
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence

@@ -32,8 +32,6 @@ X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings
   psd-deflection discover --isolable thesis:1 --out before
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import dataclasses

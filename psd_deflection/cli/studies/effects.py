@@ -10,8 +10,6 @@ a rig file lists it below `effects:`, and `discover` finds it. Your own files ar
   psd-deflection effects --json
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -12,8 +12,6 @@ rig.yaml with the modes in it.
   psd-deflection identify run.csv --json
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.cli._progress import stage

@@ -16,8 +16,6 @@ figures of docs/methods.md.
   psd-deflection thesis compare-methods --json
 """
 
-from __future__ import annotations
-
 import argparse
 import textwrap
 from pathlib import Path

@@ -14,8 +14,6 @@ and validate.json.
   psd-deflection validate run.csv --solver beam --solver wls
 """
 
-from __future__ import annotations
-
 import argparse
 
 from psd_deflection.cli._progress import stage

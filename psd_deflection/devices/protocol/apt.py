@@ -15,8 +15,6 @@ Sources: Thorlabs, "APT Communications Protocol", quad control messages 0x0870 t
 MGMSG_HW_REQ_INFO; two open drivers for the scales and the sign of x.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import NamedTuple
 

@@ -18,8 +18,6 @@ example programs for the DI-1110 (counter offset) and drivers of others (reply p
 ``stop`` and ``encode`` take about a second on a DI-4108).
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Sequence

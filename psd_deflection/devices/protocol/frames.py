@@ -10,8 +10,6 @@ frames become a :class:`BadFrame` with the reason, never an exception, because i
 may contain anything.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

@@ -14,8 +14,6 @@ A line may end in ``*hh``, the exclusive-or of all bytes before the ``*`` in hex
 unnoticed. Lost lines are detected by ``seq``.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import re

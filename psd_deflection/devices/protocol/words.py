@@ -6,8 +6,6 @@ A device's JSON object comes from a stranger and goes to the log, ``/diagnostics
 Both protocols that carry one pass it through :func:`device_words`, so that nothing else ever reaches the program.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

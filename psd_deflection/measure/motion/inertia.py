@@ -12,8 +12,6 @@ b + alpha x L e_z for dX and dY, and alpha_z for theta (kinematics of a rigid bo
 left out, and so is the mass of the link beside that of its tip.
 """
 
-from __future__ import annotations
-
 import bisect
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

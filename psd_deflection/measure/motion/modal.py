@@ -15,8 +15,6 @@ the readings, with x0 the state one sample before the block. So a whole block is
 the readings is coloured within the block.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

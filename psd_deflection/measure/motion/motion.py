@@ -14,8 +14,6 @@ same four readings, is followed through the gains, so that the covariance of the
 errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

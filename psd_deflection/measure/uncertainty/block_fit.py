@@ -21,8 +21,6 @@ The readings are turned into orthogonal combinations first (:mod:`psd_deflection
 that motion is sought where the link moves the dots.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from math import pi
 from typing import NamedTuple

@@ -8,8 +8,6 @@ across them, of which the link moves the dots only to second order. The one that
 model leaves of the dots: a twist by 1 degree would move the dots' own by 15 um.
 """
 
-from __future__ import annotations
-
 import abc
 import math
 from collections.abc import Callable

@@ -21,8 +21,6 @@ that the truth stays inside; the errors are held and fade over a second. A resid
 smaller size than that of a single block.
 """
 
-from __future__ import annotations
-
 import abc
 import math
 from collections.abc import Collection

@@ -21,8 +21,6 @@ that no mean removes, of variance sum_k q^2/(2 pi^2 k^2) exp(-4 pi^2 k^2 s^2/q^2
 the characteristic function of the noise at multiples of 2 pi/q).
 """
 
-from __future__ import annotations
-
 import itertools
 from math import pi
 

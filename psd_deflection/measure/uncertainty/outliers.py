@@ -7,8 +7,6 @@ must follow one law of it: constant (dead or stuck), or its opposite (inverted).
 base line right. If two readings would do, none is named.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from psd_deflection.records import FloatArray

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit and check of a set of PSDs: all of a rig, or a subset while the others cannot be trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -18,8 +18,6 @@ H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings,
 :mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used.
 """
 
-from __future__ import annotations
-
 from math import pi
 from typing import NamedTuple
 

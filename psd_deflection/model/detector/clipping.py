@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the edges of a detector's active area leave of a spot. A run needs none of it: nothing takes it back."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import ndtr
 

@@ -16,8 +16,6 @@ calibration takes 3 to 6 as one (:class:`DetectorResponse`), the budget 1, 2, 4 
 note and data sheets on PSDs (2, 4, 5); geometry of a cut spot (1).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

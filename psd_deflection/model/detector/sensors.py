@@ -13,8 +13,6 @@ These sensors are ideal. The errors of real sensors (``sensor_nonlinearity``, ``
 ``ambient_light`` ...) are effects of the simulation.
 """
 
-from __future__ import annotations
-
 import abc
 from math import erf, pi, sqrt
 from typing import ClassVar

@@ -9,8 +9,6 @@ as the detector gives it: what is known of the beam's place. m_0 = S^-1(zero), a
 anew is independent of all other parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

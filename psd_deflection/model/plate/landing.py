@@ -12,8 +12,6 @@ the reference section. The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (t
 ``landing`` takes floats: a solver calls it once a block. ``landings`` is the same formula for arrays.
 """
 
-from __future__ import annotations
-
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.model.plate.plate import Beam, Number, Pose, Row, Turns, turns_of
 from psd_deflection.records import FloatArray

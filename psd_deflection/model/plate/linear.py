@@ -7,8 +7,6 @@ coordinates on the left (4.5, 4.6, 4.14). Its code has two rows of another rig (
 theta_1 = -90 deg, theta_2 = -180 deg). For full rank it asks for 4.21 and 4.22; either is enough.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

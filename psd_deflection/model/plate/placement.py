@@ -17,8 +17,6 @@ Tilts phi and omega need more. Two coplanar PSDs do not see them (the Jacobian's
 5, and 3 at rest). Three PSDs see them if their surfaces are at different heights.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

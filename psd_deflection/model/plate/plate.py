@@ -17,8 +17,6 @@ translation enter only as l - d, so dq/dl = -dq/d(dX, dY).
 call would dominate. ``crossings`` and ``flat_poses`` are the same formulas for arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal, TypeVar
 

@@ -6,8 +6,6 @@
 without approximation, what that model leaves out: inclined beams and tilted sensors.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from psd_deflection.records import FloatArray

@@ -15,8 +15,6 @@ This keeps the file a valid ROS 2 parameter file. A law has its text there too, 
 where the file, or a recording made with it, is read.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib.util

@@ -3,8 +3,6 @@
 """Reads the YAML file of a law: what is wrong with it is said with file, key, value and what is
 allowed."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@
 follows keeps in ``state`` what the next block needs.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -7,8 +7,6 @@ transfer function (b1 z^-1 + b2 z^-2)/(1 + a1 z^-1 + a2 z^-2): the sample at t s
 applied before t, so there is no direct term.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

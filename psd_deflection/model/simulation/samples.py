@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Consecutive samples on their way through the stages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

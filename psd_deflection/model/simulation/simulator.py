@@ -3,8 +3,6 @@
 """The forward model: from loads to converter counts, all at once or in steps of any size with the same bits: states are
 kept, every operation is elementwise or a recursive filter, noise is drawn sample by sample."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial

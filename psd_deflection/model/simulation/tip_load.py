@@ -3,8 +3,6 @@
 """From the tip's pose to the load that causes it, at rest, through the effects that the rig file lists, the last one
 first; it knows no effect by name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.arithmetic import FIXED

@@ -17,8 +17,6 @@ assumption: ``no_twist`` (5.3's own assumption: dX, dY, phi, omega), or ``beam``
 = +k dX/L: dX, dY, theta, and one plane is enough unless k L_i/L = 1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 

@@ -9,8 +9,6 @@ starting from the flat plate's answer. The tilts matter if the sensitive surface
 reference section: at a height of 20 mm, a flat model's dY is wrong by 115 um under 50 N.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, ClassVar
 

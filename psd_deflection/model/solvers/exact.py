@@ -17,8 +17,6 @@ the rotation of the base line between the dots, whatever the weights of the PSDs
 method starts there and doubles its digits each time. The covariance is (J^T W J)^-1 at the answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

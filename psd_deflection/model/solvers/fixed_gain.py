@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driver of the linear methods: a gain matrix that does not depend on the noise."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic

@@ -8,8 +8,6 @@ step is some thousand times smaller than the one before, and four or five suffic
 (J^T W J)^-1 at the last step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

@@ -12,8 +12,6 @@ phi (about X) and omega (about Y), R = Ry(omega) Rx(phi) Rz(theta).
 per call would dominate. ``solve_many`` takes and returns arrays of n blocks.
 """
 
-from __future__ import annotations
-
 import abc
 from dataclasses import dataclass
 from enum import IntEnum

@@ -14,8 +14,6 @@ the disagreement counts equally in x and y and in both signs. The disagreement g
 the angle, repeated until the angle no longer changes. d is then the mean of the Delta_i.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -20,8 +20,6 @@ keeps what is across. In R = Ry(omega) Rx(phi) Rz(theta) that is theta = alpha +
 so that the published angles have the dots that were read. alpha itself is theta with ``angles='azimuth'``.
 """
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Any, ClassVar, Literal
 

@@ -8,8 +8,6 @@ d' = R(-theta) d + (1 - cos theta) lbar, lbar the mean of the l_i: the turn of d
 not the sine, is its largest error (43 um at 1 degree and 2 mm).
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

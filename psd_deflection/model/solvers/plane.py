@@ -12,8 +12,6 @@ weighted mean. This eliminates f and leaves one unknown, so neither the estimate
 needs a matrix.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from psd_deflection.base.errors import SolverError

@@ -9,8 +9,6 @@ deviation of about a millidegree. Five unknowns, 2P readings, Gauss-Newton from 
 answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

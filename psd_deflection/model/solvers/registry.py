@@ -3,8 +3,6 @@
 """The solver names of ``solver:`` and ``solvers:``. To add a method, write a
 :class:`~psd_deflection.model.solvers.interface.Solver` and add a line here; it is imported when it is used."""
 
-from __future__ import annotations
-
 import importlib
 from types import MappingProxyType
 from typing import Any, NamedTuple

@@ -8,8 +8,6 @@ in ``beam``, but how much the plate tilts is not known: k is somewhere between 0
 ``link.slope_ratio``. The answer is that of the middle, and its covariance allows for either end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar

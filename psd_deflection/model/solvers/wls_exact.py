@@ -14,8 +14,6 @@ weights (0 if the weights of x and y agree: then theta = asin theta'). One arcsi
 readings are combined as ``wls`` combines them, ``thesis`` weights included.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np

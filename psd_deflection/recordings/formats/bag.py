@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag of ROS 2: a folder of MCAP files with ``metadata.yaml``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from psd_deflection.recordings.formats.format import Format, ReadOptions, Sink, WriteOptions

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """CSV: a row a sample; or the estimates, or the poses of a camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from psd_deflection.recordings.formats.format import Format, ReadOptions, Sink, WriteOptions

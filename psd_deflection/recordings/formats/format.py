@@ -3,8 +3,6 @@
 """The declaration of a format, how one is read and written; all formats, ours and those of other packages (entry points
 of the group ``psd_deflection.formats``), and which of them a path means."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP: one file with the messages of a run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from psd_deflection.recordings.formats.format import Format, ReadOptions, Sink, WriteOptions

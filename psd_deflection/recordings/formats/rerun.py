@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun: what is computed of a recording, to look at."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from psd_deflection.recordings.formats.format import Format, Sink, WriteOptions

@@ -6,8 +6,6 @@ Sample numbers are recorded modulo 2^32. They are extended again, so that the bl
 not a multiple of 20).
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import re

@@ -6,8 +6,6 @@ The clouds of one recording differ only in stamp, width and points. So the bytes
 once and then only compared. A message that differs goes to the generic decoder.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads CSV recordings, one sample per row, header first, also from other loggers, in passes and never whole."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Iterator, Sequence

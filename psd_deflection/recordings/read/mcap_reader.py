@@ -3,8 +3,6 @@
 """Reads one MCAP file (https://mcap.dev/spec) from front to back, even cut or damaged, with a warning. Every size that
 it declares is compared with the file's own or with the allowance before it is used."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import zlib

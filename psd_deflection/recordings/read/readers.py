@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens a recording of any format: every command that reads one does it by this."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

@@ -6,8 +6,6 @@ The table is a CSV with a header: ``t`` (s) and ``dx,dy,theta`` (m, m, rad); ``s
 there are any. A row whose status is not ``ok`` has no measurement. ``psd-deflection camera`` writes such tables.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence

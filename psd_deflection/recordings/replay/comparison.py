@@ -3,8 +3,6 @@
 """Compares the messages of a replay with the recorded ones, byte by byte, in streams, by topic and stamp; a recording
 may be partial. Rounding is counted apart: a defect only if nothing that computes has changed (provenance)."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping

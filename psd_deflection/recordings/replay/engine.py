@@ -3,8 +3,6 @@
 """Replay: a recording through the same pipeline as in the live node, block by block, for commands, monitor and
 benchmarks."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

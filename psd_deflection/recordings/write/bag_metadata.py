@@ -6,8 +6,6 @@ A bag holds the QoS of a topic twice, in ``metadata.yaml`` and in the MCAP chann
 skip a topic if the two differ, so both are made here from one value.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 """Writes rosbag2 bags and single MCAP files. A crash costs at most a second: chunks span less than half a second, and
 the rig is the first message of every file."""
 
-from __future__ import annotations
-
 import abc
 import contextlib
 import json

@@ -6,8 +6,6 @@ Numbers are written with enough digits to read the same number back (float32 vol
 poses), times with nine decimals.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections import deque

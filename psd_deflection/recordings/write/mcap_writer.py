@@ -6,8 +6,6 @@ The format: https://mcap.dev/spec. The chunk indexes, a kilobyte each (180 MB a 
 end.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections import defaultdict

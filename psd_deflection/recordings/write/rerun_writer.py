@@ -3,8 +3,6 @@
 """Writes a Rerun recording with its layout, in µm, mdeg and mm. A block without an estimate breaks the line; a lost one
 appears only in the count of lost samples."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from pathlib import Path

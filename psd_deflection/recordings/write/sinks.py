@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes a recording of the format that its name says."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from pathlib import Path
 

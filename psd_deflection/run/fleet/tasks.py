@@ -3,8 +3,6 @@
 """Many recordings: which they are by the words of a command line, one task for each on one of several engines (this
 process, processes of this machine, Dask; all through :mod:`concurrent.futures`), answered in their order."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import glob

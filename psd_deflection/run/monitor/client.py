@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Speaks to a running daemon over its page: requests, and what it measures. For commands without ROS."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http.client

@@ -5,8 +5,6 @@
 Items that do not fit into the queue are dropped and counted. Publishing and recording are not affected.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import queue

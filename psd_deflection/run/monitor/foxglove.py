@@ -3,8 +3,6 @@
 """Serves the messages of the graph to Foxglove, without ROS (``foxglove.websocket.v1``): the same topics, types and
 bytes. A slow viewer loses its oldest messages; viewers can only look."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

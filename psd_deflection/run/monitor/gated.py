@@ -3,8 +3,6 @@
 """A web server in a thread of its own, with the gate that every view of the daemon has: who may see it, who may press
 its buttons. It takes bounded numbers of viewers and connections, and waits for none."""
 
-from __future__ import annotations
-
 import abc
 import asyncio
 import contextlib

@@ -4,8 +4,6 @@
 samples, estimates. Rings of fixed memory, merged exactly to what is asked; a time without blocks has no cell, and time
 that goes back forgets what lies after it."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

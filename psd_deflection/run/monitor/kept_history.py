@@ -3,8 +3,6 @@
 """Keeps the page's history of a week in an SQLite file per device, written once a minute by a thread of its own. A
 damaged file is put aside; nothing that the disk does reaches the page or the run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import queue

@@ -6,8 +6,6 @@ Source: OpenMetrics 1.0 (2020). Counters end in ``_total``, a unit is the end of
 follows ``# EOF``. Units are SI. A number that is not known has no line.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 """The pages that this user's daemons serve now, a small file each below ``$XDG_STATE_HOME/psd_deflection`` that only
 the user can read (it holds the token), so that commands find them without an address."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.metadata
 import importlib.util

@@ -3,8 +3,6 @@
 """The page's own thread: an aiohttp server with the page, a websocket and its buttons; buffers of fixed size. A browser
 that is too slow misses rows, and nothing waits for it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The source of the page: what it has to give, a running session, and its calibration as a process of its own."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording played in real time, as the source of the page."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import threading

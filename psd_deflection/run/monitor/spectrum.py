@@ -3,8 +3,6 @@
 """Amplitude spectral density of the dots from the last seconds of raw samples (Welch, IEEE Trans. Audio Electroacoust.
 15, 1967: Hann windows, half overlapping). A lost sample, or one without light, ends a segment."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

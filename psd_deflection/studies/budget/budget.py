@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every source of error does to ΔX, ΔY and θ of one rig under one load, and the load if the user names none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

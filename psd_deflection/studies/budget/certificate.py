@@ -11,8 +11,6 @@ causes of the error budget that no calibration measures. The zero is taken befor
 count.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

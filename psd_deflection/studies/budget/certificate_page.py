@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A certificate of calibration: what it is made from, its page, and its numbers as tables that a spreadsheet opens."""
 
-from __future__ import annotations
-
 import csv
 import html
 import io

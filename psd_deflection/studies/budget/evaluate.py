@@ -3,8 +3,6 @@
 """The budget: every cause at one situation, E_C of the method itself, totals and expanded uncertainty, and the Monte
 Carlo that must agree (JCGM 100:2008, JCGM 101)."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

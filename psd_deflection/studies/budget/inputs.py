@@ -4,8 +4,6 @@
 half-width of a uniform distribution, a "typical" value a standard deviation, an "assumption" a guess to replace
 first."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

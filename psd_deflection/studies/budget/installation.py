@@ -3,8 +3,6 @@
 """Terms of the environment and the beams, and of the installation: where the sensors sit, how they are turned, and how
 the tip tilts (Table 3.1, 3.2)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

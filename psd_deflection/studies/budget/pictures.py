@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bars of an error budget, for its page and for a file."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

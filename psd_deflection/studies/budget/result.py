@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The answer of budget: each cause's error, the totals, the chart."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

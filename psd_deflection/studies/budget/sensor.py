@@ -3,8 +3,6 @@
 """Terms of the sensor, of the amplifier and converter behind it, and of the light before it (Table 3.1, group 1; 3.1 to
 3.4, corrected)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 """What recordings say of a rig. A parameter or direction whose standard deviation stays above ``OPEN`` of its tolerance
 is undetermined: it keeps the file's value and tolerance. A prior that the recordings contradict is widened."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple

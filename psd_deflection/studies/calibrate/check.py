@@ -13,8 +13,6 @@ directions of it. The smallest p over the groups, times their number, below ``LE
 and the reference's clock are free in any case.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

@@ -12,8 +12,6 @@ readings, v + o and v_dark + o, and stays: v_laser + o. It is taken off with the
 output is taken for light: a share o/S of the gains, which a reference finds as such.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -20,8 +20,6 @@ alternation with p. Rows beyond ``FAR`` are outliers and count for nothing. If t
 from row to row, its rows are weighted as the smaller number of independent ones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal
 

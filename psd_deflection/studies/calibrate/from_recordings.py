@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads recordings for calibrate into arrays on a sample grid without gaps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sections of the page of calibrate."""
 
-from __future__ import annotations
-
 import html
 from typing import Any
 

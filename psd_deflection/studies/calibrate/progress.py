@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far a calibration is: what the motion so far has determined, what is open, and what would determine it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The answer of calibrate: calibration.json, the page, and the rig file (docs/calibration.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path

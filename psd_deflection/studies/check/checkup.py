@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check of a rig: wiring, loads, noise and light against its rig file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

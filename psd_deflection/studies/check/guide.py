@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Leads a person through three pushes: says what to do next, and sees when the link rests, is pushed and is let go."""
 
-from __future__ import annotations
-
 from collections import deque
 from enum import Enum
 

@@ -3,8 +3,6 @@
 """The answer of check: what the rig file has wrong, how sure that is, and the lines that put it
 right."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

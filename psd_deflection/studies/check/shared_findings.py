@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What check and discover both judge, once: noise, and what was noted of the loads, against file and recording."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

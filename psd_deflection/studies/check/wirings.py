@@ -4,8 +4,6 @@
 share of the squared movement that the expected pattern leaves, 0 to 1. A wrong sign leaves half or more, 25 degrees
 a fifth."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

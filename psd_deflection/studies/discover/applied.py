@@ -3,8 +3,6 @@
 """Free loads of a search: what hung where another load was noted, and weights that sway. If all notes are wrong, loads
 are free only if the search has failed and free loads then leave next to nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from functools import partial

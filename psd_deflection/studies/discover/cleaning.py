@@ -5,8 +5,6 @@
 These samples become NaN and cost precision, nothing else. What a person should know of them is a :class:`Finding`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -5,8 +5,6 @@
 ``report`` makes its page.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace

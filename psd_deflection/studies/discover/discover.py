@@ -5,8 +5,6 @@
 The default answer is "nothing missing". A discrepancy that no effect explains is described as unknown.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace

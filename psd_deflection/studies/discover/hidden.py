@@ -3,8 +3,6 @@
 """What the search adjusts besides the catalogue's effects, each declared as one: mistakes of the set-up, which become
 lines for the rig file, free loads, and how the link moved before the first sample."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

@@ -3,8 +3,6 @@
 """Which effects could be told apart, from the rig and planned loads alone: seen from the size at which a search accepts
 it, named from the size at which the part that no other effect imitates reaches ``SEPARATES``; to first order."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a law may be made of: terms, and how much of a residual each explains to first order, without a simulation."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -3,8 +3,6 @@
 """A law for what no effect explains: terms scored to first order, the best refitted in the simulation and chosen by
 BIC. It is reported if it passes the rule for an effect and explains most of what is left."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

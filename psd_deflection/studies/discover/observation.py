@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The input of discover: one recording as arrays on a complete sample grid, lost samples NaN, with its own rig."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 """The next recording: of those that the limits allow, the one whose chi-square best tells the named model from its
 rivals, averaged over all pairs and counted up to ``SURE``; with less effort at the same value."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence

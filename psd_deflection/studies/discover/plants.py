@@ -3,8 +3,6 @@
 """What a machine that simulates itself tells of itself, so that :func:`discover_in` can ask it; and a table of readings
 as such a machine."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from abc import ABC, abstractmethod

@@ -5,8 +5,6 @@
 :class:`Recorded` is frozen; each of the ``STEPS`` takes one and gives the next.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -3,8 +3,6 @@
 """Of 2P readings of P PSDs a plate moves three; the other 2P - 3, orthonormal in units of noise, ask before any model
 of the link whether a detector, beam or amplifier is at fault."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

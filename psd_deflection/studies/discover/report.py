@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sections of the page of discover, for readers who have not seen the experiment."""
 
-from __future__ import annotations
-
 import html
 import itertools
 from collections.abc import Iterable

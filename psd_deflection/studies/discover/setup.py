@@ -4,8 +4,6 @@
 is held against the whole recording, with free sizes of the loads that tell their signs and units; another than the rig
 file's must leave ten times less."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ An effect is named only if all of these hold: library-wide p <= 1e-4 (0.01 of a 
 than 10, a gain of more than two standard errors on held-out load cases, and parameters within their bounds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a search found, as trees of result.json and as sizes for a person (docs/discover.md)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any

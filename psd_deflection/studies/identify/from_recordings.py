@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What identify looks at: the poses of single samples of a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 

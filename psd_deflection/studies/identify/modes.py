@@ -16,8 +16,6 @@ If the link never rings alone, its mode is that of its spectrum
 (:mod:`psd_deflection.studies.identify.spectra`).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

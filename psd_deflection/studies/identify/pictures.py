@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pictures of the page of identify."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Modes of one axis, and the spectrum from which they stand out: peaks, white and coloured noise, operation."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Sequence

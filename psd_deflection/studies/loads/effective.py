@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What hung on the link of a recording: loads noted otherwise than they were, unknown times, weights that sway."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

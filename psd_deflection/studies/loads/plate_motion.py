@@ -3,8 +3,6 @@
 """Readings taken apart: a movement of the plate, and the 2P - 3 combinations of P PSDs that no movement of a plate
 makes."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import null_space
 

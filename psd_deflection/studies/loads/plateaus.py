@@ -3,8 +3,6 @@
 """What hung on the link, if it is not what was noted: the constant load between two changes that moves the plate as it
 did. A few wrong notes stand out beside an effect, which acts in proportion to the loads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

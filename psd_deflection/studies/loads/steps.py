@@ -3,8 +3,6 @@
 """Steps of the dots that last, by means over whole bending periods on either side of a moment, and when each load began
 to act: fitted with the ringing that follows. Only natural frequencies are taken from the rig file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

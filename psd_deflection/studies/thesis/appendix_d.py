@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's methods as printed: sections 2.2 and 2.3, and the MATLAB code of Appendix D; for comparison only."""
 
-from __future__ import annotations
-
 from math import acos, atan, atan2, cos, hypot, inf, nan, pi, remainder, sin, sqrt, tan
 from typing import ClassVar, Literal, NamedTuple, get_args
 

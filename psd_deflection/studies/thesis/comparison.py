@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors of each method of the thesis, by condition: Table 5.1, Figures 5.30 to 5.35 (``thesis``)."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures of docs/methods.md that the methods draw: ``thesis compare-methods --out DIR``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

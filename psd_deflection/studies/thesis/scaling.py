@@ -3,8 +3,6 @@
 """Appendix B: a flexible link BC, clamped at B, carries a rigid CD at right angles under a force P at D. Each printed
 cell is what the stated modulus gives, or an erratum with its reason."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from decimal import Decimal

@@ -3,8 +3,6 @@
 """What two instruments that measured the same motion differ by: bias and 95 % limits (Bland and Altman, Lancet 327,
 307, 1986), and scale and noise by regression of the reference on the estimate, the less noisy of the two."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ fitted motion: Gauss-Newton on offset, bias and a 3 x 3 matrix of scales, with T
 the one of Newey and West (Econometrica 55, 703, 1987) if that is larger: what is left over may have a memory.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

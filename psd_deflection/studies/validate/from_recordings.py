@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What validate compares: the motion of a recording as each solver has it, and a reference."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compares the motion of a recording, as each solver has it, with a reference: the answer, its tree and its page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs the watch over a recording, by the records that its replay gives: the same as ``replay --watch``."""
 
-from __future__ import annotations
-
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.charts import moments
 from psd_deflection.recordings.recording import Recording

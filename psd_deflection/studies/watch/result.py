@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The answer of the watch over a recording: its alarms."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

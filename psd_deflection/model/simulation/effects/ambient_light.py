@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Light that is not the laser pulls the reading to its own centroid (E_DC, stray light)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

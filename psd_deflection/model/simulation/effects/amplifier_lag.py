@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The amplifier is a first-order low-pass."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ If the signal is without noise (``samples.noise`` > 0), the result is the mean o
 signal. This keeps a comparison fair where the signal is close to the limit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import ndtr
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each axis of a PSD reads a part of the other axis."""
 
-from __future__ import annotations
-
 from psd_deflection.model.detector.response import crossed, uncrossed
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The link is stiffer or softer than the rig file says: EI."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY, Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 

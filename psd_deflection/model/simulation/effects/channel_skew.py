@@ -6,8 +6,6 @@ Volts between samples come from the model at that time, so a delay of any size i
 load step too. No future sample is used: a value before a sample is one after the sample before.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The clamp sticks: the deflection lags behind the load by half a loop, whichever way it moves."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.model.simulation.law_forms import play
 from psd_deflection.model.simulation.samples import SimulatedSamples

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The deflection continues to grow after each change of load."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.model.simulation.modes import Filter, held_lag_coefficients
 from psd_deflection.model.simulation.samples import SimulatedSamples

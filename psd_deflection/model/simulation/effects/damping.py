@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The modes lose energy faster or slower than the rig file says."""
 
-from __future__ import annotations
-
 import math
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values

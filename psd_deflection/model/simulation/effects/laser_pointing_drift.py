@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One beam wanders steadily."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The force does not point where the load record says."""
 
-from __future__ import annotations
-
 import math
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values

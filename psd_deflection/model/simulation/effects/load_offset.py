@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The load acts beside the centroid, so that a force also turns the tip."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 

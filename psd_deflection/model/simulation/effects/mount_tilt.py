@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The base is not square to the beams: the tip is displaced by a slope times the length."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tip plate leans with the bending slope, so that the beams meet it at an angle (E_Tilt)."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 

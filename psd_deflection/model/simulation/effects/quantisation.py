@@ -6,8 +6,6 @@ If the signal is without noise (``samples.noise`` > 0), the result is the mean o
 bias of rounding is a Fourier series whose terms the noise damps as exp(-2 (pi k sigma/step)^2).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Air of another temperature bends both beams alike (E_RF)."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A further bending mode rings on top of the first."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, State, Traced, Values
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.physics import Physics

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A PSD reads too large or too small."""
 
-from __future__ import annotations
-
 from psd_deflection.model.detector.response import scaled, unscaled
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples

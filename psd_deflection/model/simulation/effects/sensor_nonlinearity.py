@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A PSD reads more (or less) the farther the dot is from its centre (E_R)."""
 
-from __future__ import annotations
-
 from psd_deflection.model.detector.response import grown, shrunk
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A PSD's centre is not where the rig file says."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A PSD's axes are turned in its plane (E_Algn)."""
 
-from __future__ import annotations
-
 from psd_deflection.base.arithmetic import Arithmetic
 from psd_deflection.model.detector.response import rotated
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values

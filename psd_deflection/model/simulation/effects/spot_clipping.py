@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Part of the spot leaves the active area, and the centroid of the rest is read (E_LP)."""
 
-from __future__ import annotations
-
 from psd_deflection.model.detector.clipping import cut_by_edges, cut_disc
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples

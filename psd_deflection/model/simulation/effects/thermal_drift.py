@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reading of one PSD moves with temperature (E_TH)."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, Reading, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 

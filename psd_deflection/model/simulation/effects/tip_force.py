@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A force that no reading of the load shows always pulls at the tip: the load cell's zero, or what hangs there."""
 
-from __future__ import annotations
-
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A mass at the tip that is missing from the rig file lowers the bending frequency."""
 
-from __future__ import annotations
-
 import math
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values

@@ -3,8 +3,6 @@
 """Measured against simulated, as whitened vectors of one likelihood: what search, refit, hold-out and verdict ask of
 the rig with its recordings or of any machine that simulates itself."""
 
-from __future__ import annotations
-
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

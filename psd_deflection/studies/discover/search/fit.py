@@ -3,8 +3,6 @@
 """Bounded Levenberg-Marquardt refit of effects on the whitened residual. scipy's least_squares neither counts and
 shares simulations nor keeps the Jacobian for covariance and hold-out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 """Where simulation and data differ: energy per channel, load case and frequency band against a bootstrap of the largest
 cell, and how much of each channel follows a regressor (loads, rate, history, dot position, temperature, time)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@
 1993; tempered Gibbs sampler, Zanella and Roberts 2019) and the mean taken. The error on unseen cases is nested: terms
 and sizes are chosen anew without the cases that judge them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starting values that a search by derivatives cannot find: frequencies, limits, coarse steps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

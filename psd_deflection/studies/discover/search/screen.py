@@ -4,8 +4,6 @@
 candidate's gain is T = g'F^-1 g: the drop of chi-square to first order; with nothing missing, chi-square of as many
 columns."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence

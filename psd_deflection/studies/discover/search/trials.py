@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every step of a search does: refit from some starts, and hold the results against each other."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math

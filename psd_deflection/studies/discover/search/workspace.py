@@ -3,8 +3,6 @@
 """Recordings and simulations as whitened means of a few milliseconds, so that half the squared length of a residual is
 its negative log-likelihood. All simulations are run and counted here."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Self
