@@ -393,7 +393,7 @@ def _residual_words(discovery: Conclusion) -> str:
     )
     if not math.isfinite(discovery.gap_floor):
         return after
-    return f'{after}, {discovery.floors:.2f} times what noise alone leaves ({floor})'
+    return f'{after}, {discovery.floors:.2f} times the noise floor ({floor})'
 
 
 def _setup(discovery: RigConclusion) -> str:

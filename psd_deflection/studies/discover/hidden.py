@@ -142,7 +142,7 @@ def mistakes(
         _factor('torsion_frequency', _torsion, 'link', 'natural frequency of the torsion'),
     ]
     if delays:
-        delay = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
+        delay = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'delay of the recorded load times', grid=tuple(delays))
         late_loads = Effect(
             'load_delay',
             'load',

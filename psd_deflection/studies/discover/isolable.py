@@ -1,7 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which effects could be told apart, from the rig and planned loads alone: seen from the size at which a search accepts
-it, named from the size at which the part that no other effect imitates reaches ``SEPARATES``; to first order."""
+"""Which effects could be told apart, from the rig and planned loads alone: detectable from the size at which a search
+accepts it, identifiable from the size at which the part that no other effect imitates reaches ``SEPARATES``; to first
+order."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -65,7 +66,7 @@ class Isolable:
         return (self.label, self.parameter, *sizes, self.alike)
 
 
-HEAD = ('effect', 'size', 'seen from', 'named from', 'most like')
+HEAD = ('effect', 'size', 'detectable from', 'identifiable from', 'most like')
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -157,7 +157,7 @@ def test_a_mistake_is_reported_with_its_line(workspace: Workspace) -> None:
     for late, word in ((0.04, 'late'), (-0.04, 'early')):
         finding, lines = words('load_delay', late_by=late)
         assert (finding.where, finding.value, lines) == ('load_fx load_fy load_tz', late, {})
-        assert finding.fix == f'the loads are noted 0.04 s {word}: subtract {late:g} s from their times'
+        assert finding.fix == f'the recorded load times are 0.04 s {word}: subtract {late:g} s from them'
     finding, lines = words('jump', recording=2.0, psd=1.0, time_us=2_500_000.0, jump_x=3e-6, jump_y=-4e-6)
     assert (finding.where, finding.value, lines) == ('psd_1', 2.5, {})
     assert finding.fix.startswith('PSD 1 of second jumps by 3 µm along x and -4 µm along y')
@@ -629,7 +629,7 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
     off = f'ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad'
     assert found.sentence == (
         f'sensor_rotation (psd 2) is missing from the model; adding it closes the gap from {before:.3f} to {left:.3f} '
-        f'µm, {found.floors:.2f} times what noise alone leaves ({1e6 * found.gap_floor:.3f} µm). '
+        f'µm, {found.floors:.2f} times the noise floor ({1e6 * found.gap_floor:.3f} µm). '
         f'Fitted: sensor_rotation {size}. Without it an estimate is wrong by up to {off}.'
     )
 
@@ -705,7 +705,7 @@ def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
 def test_other_answers_have_other_sentences(found: Discovery) -> None:
     (named,) = found.effects
     floor = f'{1e6 * found.gap_floor:.3f} µm'
-    left = f'{1e6 * found.gap_after:.3f} µm, {found.floors:.2f} times what noise alone leaves ({floor})'
+    left = f'{1e6 * found.gap_after:.3f} µm, {found.floors:.2f} times the noise floor ({floor})'
     before = f'{1e6 * found.gap_before:.3f}'
 
     def sentence(**given: Any) -> str:
