@@ -51,7 +51,7 @@ ZERO_BLOCKS = 25
 
 
 def zero_variances(rig: Rig) -> tuple[float, ...]:
-    """Variances (2P,), m^2, of a zero that does not tell its own: of as many blocks, with the noise of the rig file."""
+    """Variances (2P,), m^2, of a zero without its own: of a mean over ``ZERO_BLOCKS``, noise of the rig file."""
     return tuple(float(v) / rig.estimator.block_size / ZERO_BLOCKS for v in dot_noise_variances(rig))
 
 
@@ -78,7 +78,7 @@ class PipelineCounters:
 
 
 class Pipeline:
-    """Samples in, records out. ``misfits``: of the last change, what no part of this rig could go on from.
+    """Samples in, records out. ``misfits``: a message for each state of the last change that this rig cannot restore.
 
     Raises SolverError or ConfigError if the rig cannot be solved.
     """
@@ -98,7 +98,7 @@ class Pipeline:
         self._begin(rig)
 
     def _begin(self, rig: Rig) -> None:
-        """Remember nothing."""
+        """Make all parts that have a state anew."""
         self._effects = effects_of_rig(rig)
         self.tip_loads = TipLoads(rig, self._effects)
         self._recent: list[Dots] = []
@@ -174,8 +174,8 @@ class Pipeline:
     def zero(self) -> ParameterChange | None:
         """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
 
-        None if the last block was not good, if there is none yet, or if the link moves; ``zero_rejected`` says the
-        last. Replay applies the returned record again.
+        None if there is no block, if the last one was not good, or if the link moves; in the last case
+        ``zero_rejected`` says so. Replay applies the returned record again.
         """
         self.zero_rejected = ''
         if not self._recent:
@@ -214,7 +214,7 @@ class Pipeline:
         """
         self._changes += 1
         reported = dict(change.values)
-        # They say which numbers belong to no sample, and how the time map stepped; no estimate depends on them.
+        # Notes for readers: numbers that a restart of the device skipped, steps of the time map.
         for name in (RESTART, CLOCK_STEP, CLOCK_SQUEEZED):
             reported.pop(name, None)
         load = {name: reported.pop(name) for name in (KNOWN_LOAD,) if name in reported}
@@ -242,7 +242,7 @@ class Pipeline:
         self._take(rig)
         self.estimator.set_zeros(rig)
         if zeroed:
-            # The tip did not move with its zero.
+            # All poses shift with a new zero, though the tip did not move: the old filter would see a jump.
             self.motion_filter = self._new_filter()
 
     def _apply_load(self, motion: ModalFilter, reported: State) -> None:
@@ -256,7 +256,7 @@ class Pipeline:
 
     @property
     def buffers(self) -> int:
-        """How many numbers the segment of the noise under way makes of :meth:`memory`; 0 between two segments."""
+        """How many numbers the unfinished noise segment adds to :meth:`memory`; 0 between two segments."""
         return self.estimator.noise.buffered
 
     def memory(self, rig: Rig) -> ParameterChange | None:
@@ -270,7 +270,7 @@ class Pipeline:
             if value != rig.values[name]
         }
         for part in self._parts:
-            # Before the first block the fit knows what a new one knows.
+            # Before the first block its state is that of a new one.
             if part is not self.estimator or self.last_spots is not None:
                 values |= part.state_dict()
         if not values:
@@ -280,9 +280,9 @@ class Pipeline:
         return ParameterChange(t_ns, block, tuple(values.items()))
 
     def load(self, load: AppliedLoad) -> ParameterChange | None:
-        """Tell the filter of the motion a known load; None if there is no filter, or if it holds already.
+        """Tell the filter of the motion a known load; None if there is no filter, or if this load is the last one told.
 
-        What the load does before the next block is not predicted.
+        Blocks that are processed already are not corrected for it.
         """
         if self.motion_filter is None or not self.motion_filter.is_new(load):
             return None
@@ -291,9 +291,9 @@ class Pipeline:
     def accelerate(self, base: BaseAcceleration, there_ns: int | None = None) -> int | None:
         """Tell the filter of the motion a known acceleration of the base, from the next block on.
 
-        ``there_ns``: in a replay, when it was there. Returns the time (ns) to record for that: just after the last
-        block. A replay tells it before the next block whose last sample is not before that. None if there is no
-        filter, or no block yet. Raises ValueError if the acceleration cannot be used.
+        ``there_ns``: in a replay, the recorded time of arrival. Returns the time of arrival (ns) to record: just after
+        the last block; a replay passes the acceleration before the first block whose last sample is not earlier. None
+        if there is no filter, or no block yet. Raises ValueError if the acceleration cannot be used.
         """
         if there_ns is None and self._end_ns is not None:
             there_ns = self._end_ns + 1
@@ -419,7 +419,7 @@ class Pipeline:
                 if observed.due:
                     yield TipLoad(observed.t_ns, *load)
         if self.motion_filter is not None:
-            # Poses of some PSDs have another noise than the filter knows: it coasts.
+            # A pose without all PSDs has other noise than the filter is set for: it predicts only.
             usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and answer.complete)
             moved = self._moved(self.motion_filter, observed, usable)
             if moved is not None:
@@ -441,11 +441,11 @@ class Pipeline:
     def _findings(
         self, measures: BlockMeasures, observed: ValidBlock, answer: BlockSolution, status: BlockStatus
     ) -> tuple[str, ...]:
-        """What is odd about a block; of one that is not, the noise is learnt."""
+        """Return the findings of a block; from a good block without any, the noise is learnt."""
         findings, used = observed.verdict.findings, answer.used
         if used is not None and used.excluded:
             findings = (*findings, f'psd_{used.excluded} contradicts the others and is left out')
-        # Of this block: what it has to say counts from the next one on.
+        # Before learning: what this block teaches applies from the next one on.
         vibrates = self.estimator.vibrates
         if status is BlockStatus.OK and not findings:
             self._learn(observed, measures)
@@ -460,7 +460,7 @@ class Pipeline:
         return findings
 
     def _learn(self, observed: ValidBlock, measures: BlockMeasures) -> None:
-        """Take a good block into the noise."""
+        """Update the measured noise with a good block, and the filter with the noise."""
         changed = self.estimator.learn(observed.index, observed.slots, observed.samples, measures.volts)
         if changed and self.motion_filter is not None:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
