@@ -393,6 +393,15 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8400)) == [3.01]
 
 
+@pytest.mark.parametrize(('share', 'rough'), [(0.99, False), (1.01, True)])
+def test_ringing_beyond_the_noise_of_the_blocks_is_rough(share: float, rough: bool) -> None:
+    """Blocks of +-1 um differ by 2 um: a variance of 2 um^2, ``ROUGH`` squared of which may ring."""
+    rest = 1e-6 * np.resize([[1.0, 0.0], [-1.0, 0.0]], (100, 2))
+    ringing = np.arange(100) < 10
+    rest[ringing] = share * annotated_times.ROUGH * math.sqrt(2e-12) * np.repeat([[0.0, 1.0], [0.0, -1.0]], 5, axis=0)
+    assert annotated_times.is_rough(np.repeat(rest, 4, axis=0), np.repeat(ringing, 4), 4) is rough
+
+
 def test_load_cell_noise_is_removed_for_any_times(monkeypatch: pytest.MonkeyPatch) -> None:
     dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
     noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
