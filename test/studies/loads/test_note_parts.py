@@ -313,6 +313,15 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
     assert found == pytest.approx((1003.0, 0.0), abs=3e-4)
 
 
+def test_motion_is_rough_beyond_three_times_the_noise() -> None:
+    # Steps of 1 from block to block are a variance of a half; 0, 0, c, c one of c^2/4: nine halves at sqrt 18.
+    rings = np.arange(28) >= 24
+    for c, rough in ((4.24, False), (4.25, True), (-4.25, True)):
+        rest = np.array([*(0.0, 1.0) * 12, 0.0, 0.0, c, c])[:, None] * (0.0, 1.0, 0.0, 0.0)
+        assert annotated_times.is_rough(rest, rings, 1) is rough
+    assert not annotated_times.is_rough(rest, np.arange(28) >= 25, 1)
+
+
 def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     loads, count = np.zeros((6000, 3)), 6000
     quiet = np.repeat(np.random.default_rng(1).normal(size=(300, 4)), 20, axis=0)
