@@ -47,8 +47,9 @@ def rows_of(name: str, out: Path, moved_ns: int = 0) -> dict[str, list[tuple[int
     sink = RerunFile(out, rig)
     for records in replayed(recording, Pipeline(rig)):
         for record in records:
-            later = isinstance(record, SpotMeans) and record.index >= 20
-            sink.put(replace(record, t_ns=record.t_ns + moved_ns) if later else record)
+            if isinstance(record, SpotMeans) and record.index >= 20:
+                record = replace(record, t_ns=record.t_ns + moved_ns)
+            sink.put(record)
     return sink._rows
 
 
