@@ -322,6 +322,9 @@ def test_a_setting_is_within_its_bounds(name: str, most: float) -> None:
 
 def test_bending_is_shaped_unless_modes_are_named() -> None:
     assert ShaperSettings().modes == ('bending',)
+    assert ShaperSettings(frequency=0.1).frequency == 0.1
+    with pytest.raises(ConfigError, match=r'frequency = 0.09 Hz: must be at least 0.1'):
+        ShaperSettings(frequency=0.09)
 
 
 def test_before_the_first_deflection_there_is_no_offset(arm: Arm) -> None:
@@ -429,6 +432,15 @@ def test_time_counts_from_when_the_last_one_was_sent(arm: Arm) -> None:
     loop.compensator.enable(False)
     before = loop.offsets
     assert np.abs(loop.compensator.watch(loop.t + 5.0).offsets - before).max() == pytest.approx(0.01 * 0.1)
+
+
+def test_slope_is_known_0_2_s_after_joint_and_offset_rest() -> None:
+    response, known = JointResponse(1), []
+    for n in range(100):
+        moved = np.array([0.02 * min(max(n - 50, 0), 10) / 10])
+        response.add(0.02 * n, moved, moved, 0.01)
+        known.append(bool(response.known()[0]))
+    assert known.index(True) == 70
 
 
 def test_a_fit_of_more_than_a_minute_begins_anew() -> None:

@@ -225,6 +225,8 @@ def test_limits_of_the_arm_are_those_of_its_file() -> None:
         by.shape(0, moved(1, seconds=10.0, to=-2.4), ZERO)
     with pytest.raises(ConfigError, match=r'shoulder is as fast as 2.4, must be at most 1 rad/s'):
         by.shape(0, moved(2, seconds=0.5, to=0.8), ZERO)
+    with pytest.raises(ConfigError, match=r'shoulder goes to -2.4, must be at least -2'):
+        by.shape(0, checked(['shoulder'], [0.0], [[[-2.4], [0.0], []]]), standing({'shoulder': -2.4}))
     with pytest.raises(ConfigError, match='wrist: the URDF file has no joint of that name'):
         by.shape(0, checked(['wrist'], [0.0], [[[0.0], [], []]]), standing({'wrist': 0.0}))
     assert not by.moves(S)
