@@ -229,13 +229,13 @@ def test_known_load_acts_from_its_stamp_on() -> None:
     for load in loads:
         known.add(load)
     assert [known.is_new(load) for load in loads] == [True, True, False]
-    # Samples from 0.5 to 19.5 ms; the first load acted before.
+    # Samples from 0.5 to 19.5 ms; the first load began before.
     found = known.pushed(10 * MS, first=False)
     assert found is not None
     size = np.array(COMPLIANCE) * [2.0, 0.0, -3.0]
-    acted = [expm(system(MODE) * (t - 5e-3))[:, 2] if t > 5e-3 else np.zeros(4) for t in PERIOD * (SLOTS + 0.5)]
-    np.testing.assert_allclose(found.samples, size[:, None] * [state[0] for state in acted], atol=1e-15)
-    np.testing.assert_allclose(found.end, size[:, None] * acted[-1], atol=1e-15)
+    effective = [expm(system(MODE) * (t - 5e-3))[:, 2] if t > 5e-3 else np.zeros(4) for t in PERIOD * (SLOTS + 0.5)]
+    np.testing.assert_allclose(found.samples, size[:, None] * [state[0] for state in effective], atol=1e-15)
+    np.testing.assert_allclose(found.end, size[:, None] * effective[-1], atol=1e-15)
     np.testing.assert_allclose(found.variance, (0.05 * size) ** 2)
     assert known.is_new(loads[1])
     assert not known.is_new(loads[2])

@@ -91,8 +91,8 @@ def test_restless_rig_takes_noise_colour_of_base_line() -> None:
     np.testing.assert_allclose(noise.mean_sd(), SIGMA * mean_variance(0.6) ** 0.5, rtol=0.12)
 
 
-@pytest.mark.parametrize(('present', 'told'), [(6, False), (7, True)])
-def test_blocks_of_two_samples_beyond_orders_tell_roughness(present: int, told: bool) -> None:
+@pytest.mark.parametrize(('present', 'reported'), [(6, False), (7, True)])
+def test_blocks_of_two_samples_beyond_orders_tell_roughness(present: int, reported: bool) -> None:
     """In motion, by five orders: x1 is ten times as noisy in three of five blocks, which have so many samples."""
     noise, few = stream(), np.arange(3 * SEGMENT_BLOCKS) % 5 > 1
     own = coloured(3 * SEGMENT, 0.0, 24).reshape(-1, SIZE, 4)
@@ -101,7 +101,7 @@ def test_blocks_of_two_samples_beyond_orders_tell_roughness(present: int, told: 
         slots = ALL[: 3 * present : 3] if few[block] else ALL
         noise.add(block, slots, dots[slots])
     x1, y1, *_ = noise.sample_sd()
-    assert (x1 > 2.0 * y1) == told
+    assert (x1 > 2.0 * y1) == reported
 
 
 def test_one_spike_is_not_noise() -> None:
