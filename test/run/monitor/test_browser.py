@@ -19,6 +19,7 @@ pytest.importorskip('selenium', reason='the browser tests need selenium: pip ins
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
+from psd_deflection.cli.main import main
 from psd_deflection.records import Mark
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
@@ -258,6 +259,16 @@ def test_the_first_load_is_small_and_dx_is_above_dy(page: Page, serve: Callable[
     dx, dy = page.js(HEIGHTS)
     assert dx < dy - 20
     assert 20_000 < page.js(FETCHED) < MOST_BYTES
+
+
+def test_page_of_a_recording_draws_dx_above_dy(page: Page, tmp_path: Path) -> None:
+    # Its load pulls down.
+    out = tmp_path / 'page.html'
+    assert main(['plot', str(BAGS / 'clean'), '--out', str(out)]) == 0
+    page.open(out.as_uri())
+    page.until(f'{HEIGHTS}.every(Number.isFinite)', 'traces of dX and dY')
+    dx, dy = page.js(HEIGHTS)
+    assert dx < dy - 20
 
 
 @pytest.mark.slow
