@@ -3,95 +3,22 @@
 """Counts the structure: the rooms of the package with their tests, the imports between them, and what lies beside."""
 
 import argparse
-import ast
 import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import grimp
 
 PACKAGES = ('psd_deflection', 'msg_adapters')
-MOST_COMPLEX, MOST_PARAMETERS = 20, 8
 DOCUMENTED = frozenset({'_replace', '_asdict', '_fields', '_make', '_repr_html_', '_repr_png_'})
-Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def room_of(module: str) -> str:
     """The room of a module, without the package's name; '' for the package's own file."""
     parts = module.split('.')
     return parts[0] if parts[0] != PACKAGES[0] else '.'.join(parts[1:2])
-
-
-class Measured(NamedTuple):
-    """Of a function: its paths and its parameters, without ``self``, ``cls`` and the starred ones."""
-
-    complexity: int
-    parameters: int
-
-    @property
-    def is_large(self) -> bool:
-        """Whether either number is above its bound."""
-        return self.complexity > MOST_COMPLEX or self.parameters > MOST_PARAMETERS
-
-
-def _own_nodes(function: ast.AST) -> Iterator[ast.AST]:
-    """All nodes of a function but those of functions and classes inside it."""
-    waiting = [function]
-    while waiting:
-        node = waiting.pop()
-        yield node
-        inside = ast.iter_child_nodes(node)
-        waiting += [n for n in inside if not isinstance(n, Function | ast.ClassDef)]
-
-
-def complexity(function: ast.AST) -> int:
-    """1 and each place where the way through it forks."""
-    paths = 1
-    for node in _own_nodes(function):
-        if isinstance(node, ast.BoolOp):
-            paths += len(node.values) - 1
-        elif isinstance(node, ast.Try):
-            paths += len(node.handlers) + bool(node.orelse)
-        elif isinstance(node, ast.For | ast.While | ast.AsyncFor):
-            paths += 1 + bool(node.orelse)
-        elif isinstance(node, ast.comprehension):
-            paths += 1 + len(node.ifs)
-        elif isinstance(node, ast.If | ast.IfExp | ast.match_case):
-            paths += 1
-    return paths
-
-
-def measured(source: str) -> dict[str, Measured]:
-    """The functions of a module by name; those inside a class or a function as ``Outer.inner``."""
-    out: dict[str, Measured] = {}
-
-    def visit(outer: ast.AST, prefix: str) -> None:
-        for node in ast.iter_child_nodes(outer):
-            if isinstance(node, Function):
-                of = [a.arg for a in (*node.args.posonlyargs, *node.args.args)]
-                count = len(of) + len(node.args.kwonlyargs) - (of[:1] in (['self'], ['cls']))
-                out[prefix + node.name] = Measured(complexity(node), count)
-            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-                visit(node, f'{prefix}{node.name}.')
-            else:
-                visit(node, prefix)
-
-    visit(ast.parse(source), '')
-    return out
-
-
-def large_functions(root: Path) -> dict[str, Measured]:
-    """The large functions of the package below ``root``, as ``room/module.py:Class.method``."""
-    package = root / PACKAGES[0]
-    return {
-        f'{path.relative_to(package).as_posix()}:{name}': one
-        for path in sorted(package.rglob('*.py'))
-        for name, one in measured(path.read_text(encoding='utf-8')).items()
-        if one.is_large
-    }
 
 
 def lines_of(folder: Path) -> list[int]:
@@ -138,10 +65,6 @@ def main() -> int:
         tests = sum(lines_of(root / 'test' / room))
         print(f'| `{room}` | {len(lengths)} | {sum(lengths)} | {tests} | {out} | {into} |')
     every = [n for lengths in files.values() for n in lengths]
-    large = large_functions(root)
-    print(f'\n{len(large)} large functions')
-    for name, one in sorted(large.items(), key=lambda item: item[1], reverse=True):
-        print(f'  {name}: complexity {one.complexity}, {one.parameters} parameters')
     print('', *beside(root), sep='\n')
     print(f'\n{len(files)} rooms, {len(every)} files, {sum(every)} lines, {len(between)} arrows')
     return 0

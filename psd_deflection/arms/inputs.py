@@ -79,7 +79,7 @@ class KnownJoints:
     """
 
     def __init__(self) -> None:
-        self._reported: dict[str, _Reported] = {}
+        self._reported: dict[str, _Reported] = {}  # Bound: LONGEST_LIST.
 
     def notify(self, now: float, names: Sequence[str], positions: Sequence[float]) -> None:
         """Take what a message tells; a new name is passed over if there are too many of late."""

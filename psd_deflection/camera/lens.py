@@ -36,7 +36,7 @@ class Lens:
         self.distortion = np.concatenate([distortion, np.zeros(12 - distortion.size)])
         self._straight = not self.distortion.any()
         self._inverse = np.linalg.inv(matrix)
-        self._grids: dict[tuple[int, int], FloatArray] = {}
+        self._grids: dict[tuple[int, int], FloatArray] = {}  # Bound: one size of image a camera.
 
     @classmethod
     def unknown(cls, shape: tuple[int, int]) -> Lens:

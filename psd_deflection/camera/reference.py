@@ -31,7 +31,7 @@ class CameraReference:
         self.target = make(settings)
         self._lens: Lens | None = None
         self._shape: tuple[int, int] = (0, 0)
-        self._waiting: list[tuple[int, TargetPose | NoPoseError]] = []
+        self._waiting: list[tuple[int, TargetPose | NoPoseError]] = []  # Bound: 20 MOST_REST, or twice rest.frames.
         self._rest: TargetPose | None = None
 
     @property

@@ -103,7 +103,7 @@ class ContractFrames(PortSource):
         self._psds = len(rig.psds)
         self.datagrams = Datagrams(self._validator)
         self._decoder = FrameDecoder(self._psds)
-        self._early: list[Event] = []
+        self._early: list[Event] = []  # Bound: what comes before START is answered, in 2 s.
         self._next_candidate = 0
 
     def _validator(self) -> Validator:

@@ -304,7 +304,7 @@ class SimulatedDataq:
                 answer = f'{text} {self._info.get(number, "0")}'
             case ['slist', position, word] if position.isdigit() and word.isdigit():
                 if position == '0':
-                    self._list = {}
+                    self._list = {}  # Bound: the simulated device: its 11 channels.
                 self._list[int(position)] = int(word)
             case ['srate', number] if number.isdigit() and int(number) > 0:
                 self._srate = int(number)

@@ -80,7 +80,7 @@ class ThorlabsPair(Source):
         self._x_sign = rig.acquisition.thorlabs_x_sign
         if abs(self._x_sign) != 1.0:
             raise ConfigError(f'thorlabs.x_sign = {self._x_sign:g}: must be 1 or -1')
-        self._ports: list[OpenPort] = []
+        self._ports: list[OpenPort] = []  # Bound: two ports.
         self._given_up = threading.Event()
         self._decoders = [AptDecoder(), AptDecoder()]
         self._origin_ns: int | None = None
@@ -282,7 +282,7 @@ class SimulatedAligner:
         self._serial = 69_000_000 + psd
         self._answer_ns = answer_ns
         self._input = b''
-        self._queue: list[tuple[int, bytes]] = []
+        self._queue: list[tuple[int, bytes]] = []  # Bound: the simulated device: two answers a poll.
 
     def greeting(self) -> bytes:
         """Nothing: the device only answers questions."""

@@ -79,10 +79,10 @@ class UdpPort(OpenPort):
         self._sender: Any = None
         self._heard = 0.0
         # Before there is one: those that may be it, and what waits to be sent to it.
-        self._candidates: dict[Any, _Candidate] = {}
+        self._candidates: dict[Any, _Candidate] = {}  # Bound: MOST_SENDERS.
         self._pending = b''
         self._others = 0
-        self._notices: list[Notice] = []
+        self._notices: list[Notice] = []  # Bound: one a port: that others send.
 
     def read(self, timeout: float) -> bytes:
         """Return the bytes of the sender that have arrived; empty after ``timeout`` s, but at most 0.1 s.

@@ -24,7 +24,7 @@ class BlockCutter:
         self.block_size = block_size
         self.repeated = 0
         self._last_seq = -1
-        self._pending: list[SampleBlock] = []
+        self._pending: list[SampleBlock] = []  # Bound: one block.
 
     def add(self, chunk: RawChunk, volts: np.ndarray[tuple[int, int], np.dtype[np.float32]]) -> list[SampleBlock]:
         """The blocks that ``chunk`` completes. ``volts`` float32 (n, 6): its readings in volts."""

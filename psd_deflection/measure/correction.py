@@ -48,7 +48,7 @@ class Surroundings:
     prefixes = ENVIRONMENT
 
     def __init__(self) -> None:
-        self.known: dict[str, float] = {}
+        self.known: dict[str, float] = {}  # Bound: our own names.
 
     @property
     def warmer(self) -> float:
@@ -85,8 +85,8 @@ class Correction:
         # The solvers take every beam as parallel to Z.
         self._nominal.slopes = np.zeros_like(self._nominal.slopes)
         self._psds = len(rig.psds)
-        self._sensors: list[tuple[Callable[[Reading, Values], None], Values]] = []
-        self._beams: list[ActiveEffect] = []
+        self._sensors: list[tuple[Callable[[Reading, Values], None], Values]] = []  # Bound: the rig: at most six.
+        self._beams: list[ActiveEffect] = []  # Bound: the rig: at most six.
         self._moves_optics = bool(self._true.slopes.any())
         if self._moves_optics and self._true.psds_at_base:
             raise ConfigError('beam_N.angle: a beam that leans is not corrected for PSDs at the base; set it to 0')

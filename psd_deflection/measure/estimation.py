@@ -156,7 +156,7 @@ class Estimation:
         self._set_parameter_covariance(self.zero_variances)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
-        self._subset_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}
+        self._subset_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}  # Bound: sets of at most six PSDs.
 
     def _set_parameter_covariance(self, zero_variances: tuple[float, ...]) -> None:
         """Take the uncertainty of the calibration, and of a zero with these variances (2P,) m^2, () if it has none."""

@@ -101,7 +101,7 @@ class Loudness:
 
     def __init__(self) -> None:
         # By PSD: blocks that were averaged, blocks in a row that were quiet, mean squares of x, y and sum, V^2.
-        self._noises: dict[int, tuple[float, ...]] = {}
+        self._noises: dict[int, tuple[float, ...]] = {}  # Bound: the rig: at most six.
 
     def take(self, psd: int, level: Sequence[float], noisy: bool) -> list[float]:
         """Take a block of detector ``psd`` (from 1): rms of x, y, sum, V; return those of the last blocks, V."""

@@ -67,8 +67,8 @@ class PipelineCounters:
     blocks: int = 0
     estimates: int = 0
     degraded: int = 0
-    rejected: dict[str, int] = field(default_factory=dict)
-    findings: dict[str, int] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)  # Bound: our own causes.
+    findings: dict[str, int] = field(default_factory=dict)  # Bound: our own sentences.
 
     def count_findings(self, findings: Iterable[str]) -> None:
         """Count the findings of a block by what is before their colon."""
@@ -93,7 +93,7 @@ class Pipeline:
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self.zero_rejected = ''
         self._end_ns: int | None = None
-        self.misfits: list[str] = []
+        self.misfits: list[str] = []  # Bound: one a part of the rig.
         self._changes = 0
         self._begin(rig)
 

@@ -86,7 +86,7 @@ class ClockMap:
 
     def _start(self, device_ns: int, host_ns: int) -> None:
         self._origin = device_ns
-        self._minima: list[tuple[int, int]] = []
+        self._minima: list[tuple[int, int]] = []  # Bound: WINDOW_S.
         self._bucket = 0
         self._bucket_min: tuple[int, int] | None = None
         self._anchor_device = device_ns

@@ -114,11 +114,11 @@ class _Channel:
 
     def forget(self) -> None:
         """Learn the level anew."""
-        self._learned: list[float] = []
+        self._learned: list[float] = []  # Bound: LEARN.
         self.level: float | None = None
         self._up = self._down = 0.0
         self._up_ns = self._down_ns = 0
-        self._since: list[float] = []
+        self._since: list[float] = []  # Bound: REMEMBER.
         self._last = None
 
     def add(self, value: float) -> None:

@@ -45,7 +45,7 @@ class CameraNode(BaseNode[CameraSettings]):
         self._given = given
         self._reference: CameraReference | None = None
         self._info: Any = None
-        self._since: collections.Counter[str] = collections.Counter()
+        self._since: collections.Counter[str] = collections.Counter()  # Bound: one second.
         self._last: FrameAnswer | None = None
         super().__init__(NODE_NAME, log)
 

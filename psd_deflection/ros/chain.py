@@ -59,9 +59,9 @@ class ChainNode(BaseNode[ChainSettings]):
         self.chain: ChainSession | None = None
         self._path, self._given, self._slopes = path, given, slopes
         self._signals = signals
-        self._sinks: list[PublisherSink] = []
-        self._inputs: list[InputRecorder] = []
-        self._reported: list[RigPublisher] = []
+        self._sinks: list[PublisherSink] = []  # Bound: the links of the chain.
+        self._inputs: list[InputRecorder] = []  # Bound: the links of the chain.
+        self._reported: list[RigPublisher] = []  # Bound: the links of the chain.
         self._health: list[HealthReporter] = []
         self._observed = (0, 0)
         self._frames: FramePublisher | None = None

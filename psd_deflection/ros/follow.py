@@ -84,6 +84,7 @@ class Follower:
     ) -> None:
         self._owner, self._shape, self._shaper, self._joints_fault = owner, shape, shaper, joints_fault
         self.taken = 0
+        # Bound: MOST_WAITING, and MOST_GOALS a second that end within ANSWER_S of being replaced.
         self._goals: list[_Goal] = []
         self._waiting: deque[_Goal] = deque(maxlen=MOST_WAITING)
         self._asked: _Goal | None = None

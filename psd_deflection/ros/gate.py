@@ -55,7 +55,7 @@ class InputGate:
         self._node, self._clock = node, clock
         self._limited_log = RateLimitedLog(log)
         # By topic: what subscribes to messages that were kept, once there are any.
-        self._latched: dict[str, Callable[[], None]] = {}
+        self._latched: dict[str, Callable[[], None]] = {}  # Bound: the latched inputs of a node.
         self.rejected = Tally()
         self.why: BoundedMap[str, str] = BoundedMap()
 

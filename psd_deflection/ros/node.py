@@ -68,7 +68,7 @@ class NodeLog:
         self._log = log
         self._logger = node.get_logger()
         self._publisher = publisher_of(node, ROSOUT)
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # Bound: MOST_LINES.
         self._thread: threading.Thread | None = None
         file = rcl_log_file()
         if file is not None:
@@ -181,7 +181,7 @@ class BaseNode(abc.ABC, Generic[T]):
         self.finished = self.active = False
         self._starting = False
         self._other_publishers: frozenset[str] = frozenset()
-        self._published: list[Publisher] = []
+        self._published: list[Publisher] = []  # Bound: our own topics.
         self._diagnostics: Publisher | None = None
         self.node = _made(name, overrides)
         self.node.owner = self

@@ -161,7 +161,7 @@ class PublisherSink:
         self.active = False
         self._node = node
         self._below = below
-        self._publishers: dict[str, Publisher] = {}
+        self._publishers: dict[str, Publisher] = {}  # Bound: our own topics.
         self.offer(topics)
 
     def offer(self, topics: Iterable[str]) -> None:
@@ -209,7 +209,7 @@ class InputRecorder(InputGate):
         super().__init__(node, null_log)
         self.session: Session | None = None
         self._below = below
-        self._subscriptions: dict[str, list[Subscription]] = {}
+        self._subscriptions: dict[str, list[Subscription]] = {}  # Bound: our own topics.
         self.offer(topics)
 
     def offer(self, topics: Iterable[str]) -> None:

@@ -68,8 +68,8 @@ class AlarmOut:
         self.sent = self.failed = 0
         self.failure = ''
         self._log, self._about = log, dict(about or {})
-        self._ways: list[tuple[str, Callable[[bytes], None]]] = []
-        self._logged: set[str] = set()
+        self._ways: list[tuple[str, Callable[[bytes], None]]] = []  # Bound: a command and an address.
+        self._logged: set[str] = set()  # Bound: two ways, and alarms that wait.
         if command:
             argv = _argv(command)
             self._ways.append((f'command {argv[0]}', lambda text: _run(argv, text)))
@@ -77,7 +77,7 @@ class AlarmOut:
             address = _address(webhook)
             host = urlsplit(address).hostname
             self._ways.append((f'webhook at {host}', lambda text: _post(address, text, self._ending)))
-        self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()  # Bound: MOST_WAITING.
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 

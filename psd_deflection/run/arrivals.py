@@ -53,7 +53,7 @@ class ItemQueue:
     """
 
     def __init__(self) -> None:
-        self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()  # Bound: queue_blocks, RECORDED_RESTARTS.
         self._arrived = self._taken = 0
 
     def put(self, item: Item) -> None:
@@ -85,10 +85,10 @@ class ItemQueue:
 class SampleBuffer:
     """Samples that wait to be handed over, one row each: extended number, time and readings as in the source."""
 
-    seq: list[int] = field(default_factory=list)
-    t: list[int] = field(default_factory=list)
-    readings: list[tuple[float, ...]] = field(default_factory=list)
-    flags: list[int] = field(default_factory=list)
+    seq: list[int] = field(default_factory=list)  # Bound: one block.
+    t: list[int] = field(default_factory=list)  # Bound: one block.
+    readings: list[tuple[float, ...]] = field(default_factory=list)  # Bound: one block.
+    flags: list[int] = field(default_factory=list)  # Bound: one block.
 
     def add(self, number: int, t: int, readings: tuple[float, ...], flags: int) -> None:
         """One more."""

@@ -88,7 +88,7 @@ class ChainSession:
         open_session: Callable[[str, Rig, LogCallback], Session] = lambda _, rig, log: Session(rig, log),
     ) -> None:
         self.file = file
-        self.sessions: list[Session] = []
+        self.sessions: list[Session] = []  # Bound: the links of the chain.
         self.listeners: list[Callable[[Composed], None]] = []
         self.reasons = [''] * len(file.rigs)
         self.last: Composed | None = None

@@ -122,7 +122,7 @@ class Pinger:
         self._random = random.Random()
         self._next_s = 0.0
         self._unanswered = 0
-        self._under_way: dict[int, int] = {}
+        self._under_way: dict[int, int] = {}  # Bound: MOST_UNDER_WAY.
         self._sent_ns: int | None = None
 
     def is_due(self, now_s: float) -> bool:

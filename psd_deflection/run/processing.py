@@ -101,8 +101,9 @@ class Processing:
         self.requests_dropped = 0
         self._items = items
         self._clock = clock
+        # Bound: MOST_WAITING; of those that are waited for, one a thread.
         self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
-        self._latencies: deque[tuple[int, float]] = deque()
+        self._latencies: deque[tuple[int, float]] = deque()  # Bound: one second.
         self._heard_ns = clock()
         self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
         self._outage_log = OutageLog(log)

@@ -33,7 +33,7 @@ class _Reason:
 @dataclass(slots=True)
 class _Kind:
     reported: int = 0
-    reasons: dict[str, _Reason] = field(default_factory=dict)
+    reasons: dict[str, _Reason] = field(default_factory=dict)  # Bound: MOST_REASONS.
 
 
 class RateLimitedLog:

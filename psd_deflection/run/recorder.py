@@ -78,7 +78,7 @@ class RecordingJob:
         self.folder: Path | None = None
         self.attached = False
         self.beat = time.monotonic()
-        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()  # Bound: QUEUE_BYTES.
         self.opened: Future[Path | None] = Future()
         self.closed: Future[Path | None] = Future()
         # What waits is bounded in bytes too: messages of other nodes (loads, references, marks) may be long.
@@ -124,7 +124,7 @@ class Recorder:
         self._naming = threading.Lock()
         self._opening: RecordingJob | None = None
         self._job: RecordingJob | None = None
-        self._writing: dict[RecordingJob, threading.Thread] = {}
+        self._writing: dict[RecordingJob, threading.Thread] = {}  # Bound: MOST_THREADS.
         self._threads: list[threading.Thread] = []
         self._ended = False
 

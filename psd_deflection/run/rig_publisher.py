@@ -37,7 +37,7 @@ class RigPublisher:
         self._session = session
         self._reported: Mapping[str, object] | None = None
         self._last = ParameterChange(0, 0, ())
-        self._environment: dict[str, object] = {}
+        self._environment: dict[str, object] = {}  # Bound: our own names.
         rig = session.rig
         self._every = max(round(MEMORY_S * rig.converter.sample_rate_hz / rig.estimator.block_size), 1)
         # What holds before the first block is known now; which block that is, when it comes.

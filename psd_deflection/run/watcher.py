@@ -43,7 +43,7 @@ class _Segment:
     began_ns: int
     memory: ParameterChange | None
     load: AppliedLoad | None
-    items: list[Kept] = field(default_factory=list)
+    items: list[Kept] = field(default_factory=list)  # Bound: watch_memory.
     bytes: int = 0
 
 
@@ -71,7 +71,7 @@ class Watcher:
         self._forgotten = 0
         # Held to change the segments; never while waiting for the disk.
         self._lock = threading.Lock()
-        self._segments: deque[_Segment] = deque()
+        self._segments: deque[_Segment] = deque()  # Bound: watch_memory and watch_minutes.
         self._last_ns = 0
         self._due_ns: int | None = None
         self._logged = 0

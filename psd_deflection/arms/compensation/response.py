@@ -46,12 +46,12 @@ class JointResponse:
         self._lagged = np.zeros((len(LAGS_S), joints))
         self._last_t = self._spacing = 0.0
         self._pause_t = -math.inf
-        self._rows: list[tuple[float, FloatArray, FloatArray]] = []
+        self._rows: list[tuple[float, FloatArray, FloatArray]] = []  # Bound: MOST_ROWS.
         self._begun = False
         # When a slope was right for the first time.
         self._right_t = math.inf
         # Joints whose last slope was wrong.
-        self.candidates: set[int] = set()
+        self.candidates: set[int] = set()  # Bound: the joints of the arm.
         self.slopes = np.full(joints, np.nan)
         self.half_widths = np.full(joints, np.nan)
 

@@ -60,7 +60,7 @@ class Inertia:
         self._modes = modes
         self._length = length
         self._gives = np.array([-1.0 / mode.xp.square(mode.w) for mode in modes])
-        self.reported: list[tuple[int, tuple[float, ...]]] = []
+        self.reported: list[tuple[int, tuple[float, ...]]] = []  # Bound: MOST_TOLD.
         self.ended = 0
         self.late = 0
         self.count = 0

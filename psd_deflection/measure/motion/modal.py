@@ -195,7 +195,7 @@ class KnownLoads:
     def __init__(self, modes: Sequence[Oscillator], compliance: FloatArray, size: int, period: float) -> None:
         self._modes, self._compliance = modes, compliance
         self._size, self._period = size, period
-        self._waiting: list[AppliedLoad] = []
+        self._waiting: list[AppliedLoad] = []  # Bound: MOST_LOADS.
         self.held: FloatArray | None = None
 
     def __bool__(self) -> bool:

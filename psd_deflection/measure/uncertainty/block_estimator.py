@@ -177,8 +177,8 @@ class BlockEstimator:
         variances = dot_noise_variances(rig)
         self._stated_sd = np.sqrt(variances)
         self.full = PsdSet(rig, range(len(rig.psds)), tilts)
-        self._subsets: dict[tuple[int, ...], PsdSet] = {}
-        self._pending: dict[tuple[int, ...], tuple[float, ...]] = {}
+        self._subsets: dict[tuple[int, ...], PsdSet] = {}  # Bound: sets of at most six PSDs.
+        self._pending: dict[tuple[int, ...], tuple[float, ...]] = {}  # Bound: sets of at most six PSDs.
         steps = rig.converter.volts_per_count * rig.sensitivities.ravel()
         self.noise = StreamNoise(self._size, rig.centers, rig.centers + rig.zeros, variances, steps, *self._model())
         self._meters_per_volt = 0.5 * (rig.sensitivities[:, 0] + rig.sensitivities[:, 1])

@@ -107,7 +107,7 @@ class StreamNoise:
         self.set_geometry(centers, beams, slopes, residual)
         self._mean_of = _mean_weights(size)
         self._q = basis(size, xp)
-        self._sums: list[FloatArray] = []
+        self._sums: list[FloatArray] = []  # Bound: emptied with the blocks.
         self._signals = 0
         self._search: ToneSearch | None = None
         self.tones: tuple[Tone, ...] = ()
@@ -118,7 +118,7 @@ class StreamNoise:
         self._louder = 0
         self.at_rest = False
         self._segment = -1
-        self._blocks: list[tuple[int, IntArray, FloatArray]] = []
+        self._blocks: list[tuple[int, IntArray, FloatArray]] = []  # Bound: emptied when it is full.
         self.gamma = self._from_file()
 
     def set_steps(self, steps: FloatArray) -> None:

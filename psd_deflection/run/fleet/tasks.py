@@ -234,9 +234,9 @@ class _Run(Generic[T]):
         self._engine = engine
         self._ended = ended
         self._waiting = deque(range(len(names)))
-        self._under_way: dict[Future[Outcome[T]], int] = {}
-        self._to_retry: deque[int] = deque()
-        self._ready: dict[int, Outcome[T]] = {}
+        self._under_way: dict[Future[Outcome[T]], int] = {}  # Bound: the slots of the engine.
+        self._to_retry: deque[int] = deque()  # Bound: the list that was given.
+        self._ready: dict[int, Outcome[T]] = {}  # Bound: the slots of the engine.
 
     def outcomes(self) -> Iterator[Outcome[T]]:
         for turn in range(len(self._names)):

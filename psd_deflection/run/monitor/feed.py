@@ -73,7 +73,7 @@ class Feed:
         self._limit = limit
         self._estimate: DeflectionEstimate | None = None
         self._index: int | None = None
-        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()  # Bound: QUEUE_ITEMS.
 
     def put(self, record: Record) -> None:
         """Take one record; kinds that the page does not show are ignored."""

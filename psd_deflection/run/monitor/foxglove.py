@@ -44,9 +44,9 @@ class _Viewer:
 
     def __init__(self) -> None:
         self.reported = 0
-        self.subscriptions: dict[int, int] = {}
+        self.subscriptions: dict[int, int] = {}  # Bound: one a topic.
         self._budget = ByteBudget(BACKLOG_BYTES)
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[bytes] = deque()  # Bound: BACKLOG_BYTES.
 
     def offer(self, channel: int, message: bytes, t_ns: int) -> None:
         """Let a message wait, if the viewer looks at its channel; if there is no room, the oldest is dropped."""
@@ -83,9 +83,9 @@ class FoxgloveServer(GatedServer):
         self._session = secrets.token_hex(8)
         self._lock = threading.Lock()
         # Both for as long as the server lives: one entry a topic of our own.
-        self._numbers: dict[str, int] = {}
-        self._channels: list[dict[str, object]] = []
-        self._looking: dict[web.WebSocketResponse, _Viewer] = {}
+        self._numbers: dict[str, int] = {}  # Bound: our own topics.
+        self._channels: list[dict[str, object]] = []  # Bound: our own topics.
+        self._looking: dict[web.WebSocketResponse, _Viewer] = {}  # Bound: VIEWERS.
         self._rig: tuple[bytes, int] | None = None
         for topic, type_name in (published(rig) | {name: TOPIC_TYPES[name] for name in subscribed(rig)}).items():
             self._offer(topic, type_name)
@@ -189,7 +189,7 @@ class FeedBeside(Feed):
 
     def __init__(self, server: FoxgloveServer, rig: Rig) -> None:
         super().__init__()
-        self._present = dict(rig.flat())
+        self._present = dict(rig.flat())  # Bound: our own parameters.
         self._reported = False
         self._fanout = Fanout(rig.monitor.frame_prefix)
         self._fanout.sinks.append(server)

@@ -114,10 +114,10 @@ class GatedServer(abc.ABC):
 
     def __init__(self, name: str, address: str, port: int, log: LogCallback, origins: tuple[str, ...] = ()) -> None:
         self.name, self.log = name, log
-        self.viewers: dict[web.WebSocketResponse, asyncio.Event] = {}
+        self.viewers: dict[web.WebSocketResponse, asyncio.Event] = {}  # Bound: VIEWERS.
         self._address, self._port = address, port
         self._origins = frozenset(origin.lower().rstrip('/') for origin in origins)
-        self._looked_through: set[web.RequestHandler] = set()
+        self._looked_through: set[web.RequestHandler] = set()  # Bound: VIEWERS.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ended: asyncio.Event | None = None
         self._started: Future[str] = Future()

@@ -84,6 +84,7 @@ class ShownRecording:
         self._find_span = find_span
         self._span: tuple[int, int] | None = None
         self._pipeline, self._steps = open_steps()
+        # Bound: one a connection to the page, which is answered before the next.
         self._requests: queue.SimpleQueue[tuple[Future[str], Callable[[], str]]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._woken = threading.Event()

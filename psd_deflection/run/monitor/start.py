@@ -26,7 +26,7 @@ class Views:
     """What shows a session: its page, its Foxglove server, both or neither."""
 
     def __init__(self) -> None:
-        self.parts: list[MonitorServer | FoxgloveServer | Reports] = []
+        self.parts: list[MonitorServer | FoxgloveServer | Reports] = []  # Bound: three views.
 
     def close(self) -> None:
         """End all of them."""
