@@ -112,6 +112,17 @@ def test_a_finding_that_says_nothing_of_light_leaves_the_covariance() -> None:
     assert found == quiet
 
 
+def test_half_the_light_doubles_the_noise_of_one_detector() -> None:
+    """Where both are lit by half, and the spot of one leaves its area; a twist that is none adds no variance."""
+    found = []
+    for total in (5.0, 2.5):
+        volts = at_rest(1, total)
+        volts[:, 0] = 10.0
+        found += estimates(volts, {'splitter': True, 'degraded': 'zero', 'twist_sd': 1e-12})
+    assert [e.solver for e in found] == ['one_psd', 'one_psd']
+    np.testing.assert_allclose(found[1].covariance[:5], 4.0 * np.array(found[0].covariance[:5]), rtol=1e-9, atol=1e-20)
+
+
 def calibrated(**sds: float) -> dict[str, object]:
     """A calibration that left these standard deviations; a name with ``__`` for the dot."""
     left = {name.replace('__', '.'): sd for name, sd in sds.items()}

@@ -11,7 +11,8 @@ from scipy.stats import chi2
 
 from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
 from psd_deflection.measure.uncertainty.consistency import CONTRADICTS, ConsistencyResult
-from psd_deflection.measure.uncertainty.psd_set import PlateModel
+from psd_deflection.measure.uncertainty.noise import StreamNoise
+from psd_deflection.measure.uncertainty.psd_set import PlateModel, PsdSet
 from psd_deflection.measure.uncertainty.vibration import why_moving
 from psd_deflection.model.plate.plate import Tilts, flat_points, plate_points
 from psd_deflection.records import FloatArray
@@ -137,6 +138,14 @@ def test_segments_change_the_noise_of_all_sets() -> None:
         assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
         assert len(dots) == count
     assert not BlockEstimator(rig_of(), False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
+
+
+def test_a_subset_has_the_noise_of_its_own_readings() -> None:
+    rig, own = rig_of(3), np.array([1.0, 2.0, 4.0, 8.0]) * 1e-12
+    subset = PsdSet(rig, (0, 2), 'none')
+    subset.set_noise(StreamNoise(20, rig.centers, rig.centers + rig.zeros, np.insert(own, 2, (1e-10, 1e-10)), 0.0))
+    _, covariance, _ = next(subset.fits(ALL, np.tile(rig.zeros.ravel(), (1, 20, 1))))
+    np.testing.assert_allclose(np.diag(covariance), own / 20.0, rtol=0.1)
 
 
 def test_the_base_line_is_between_the_places_of_the_dots() -> None:
