@@ -84,7 +84,7 @@ class Command(NamedTuple):
     is what would be left if they did. ``limited``: whether a limit keeps the offsets from what
     the deflection asks for. ``positions`` (n,): of the joints with the offsets, None if the output
     is offsets. ``sends``: whether the controller is to get it. ``foreign``: nothing is sent, and the
-    controller tells offsets.
+    controller has offsets.
     """
 
     offsets: FloatArray
@@ -132,6 +132,8 @@ class Compensator:
         self._verified, self._foreign = dry, ''
         # Output of commands: where the joints would be without offsets.
         self._pose: FloatArray | None = None
+        # Output of commands: ``_pose`` when we fell silent with offsets in the command of the controller.
+        self._left_pose: FloatArray | None = None
         # What the controller has, as it tells: its offsets, or its command with an output of commands.
         self._has: FloatArray | None = None
         self._has_t = -math.inf
@@ -158,9 +160,25 @@ class Compensator:
     @property
     def left(self) -> FloatArray:
         """(n,): the offsets that the controller may still have, as far as one knows, rad or m."""
-        if not self._speaks and not self._sums and self._has is not None:
-            return self._has.copy()
-        return self._offsets.copy()
+        if self._speaks or self._has is None:
+            return self._offsets.copy()
+        return self._kept() if self._sums else self._has.copy()
+
+    def _kept(self) -> FloatArray:
+        """Output of commands, while nothing is sent: the offsets that the command of the controller still has from us.
+
+        Zeros if that command is not between what we sent last and the pose without offsets: somebody else's.
+        """
+        none = np.zeros(len(self._offsets))
+        if self._left_pose is None or self._sent is None or self._has is None:
+            return none
+        sent, then = self._sent
+        ours = sent - self._left_pose
+        if self._has_t <= then:
+            return ours
+        kept = self._has - self._left_pose
+        inside = np.minimum(ours, 0.0) - FOREIGN <= kept, kept <= np.maximum(ours, 0.0) + FOREIGN
+        return kept if np.all(inside) else none
 
     @property
     def owed(self) -> bool:
@@ -266,7 +284,7 @@ class Compensator:
         self._look(now)
         if not self._speaks and self.enabled:
             self._unready = '' if self._fault else self._begin(now)
-        elif not self._speaks and self._owed and not self._other_publisher:
+        elif self.owed and not self._other_publisher:
             self._unready = self._begin(now)
         self._foreign = self._look_for_foreign(now)
         self._give_up(now)
@@ -309,8 +327,13 @@ class Compensator:
 
     def _look_for_foreign(self, now: float) -> str:
         """Offsets that the controller tells while nothing is sent, in words; '' if there are none."""
-        if self._speaks or self._sums or self._dry or self._has is None or now - self._has_t > FOREIGN_S:
+        if self._speaks or self._dry or self._has is None or (now - self._has_t > FOREIGN_S and not self._sums):
             return ''
+        if self._sums:
+            kept = self._kept()
+            worst = int(np.abs(kept).argmax())
+            what = f'the command of the controller keeps {kept[worst]:.3g} from here at {self.arm.names[worst]}'
+            return f'{what}: {self._unready}' if kept[worst] else ''
         worst = int(np.abs(self._has).argmax())
         # What we sent last may still be on its way back to us.
         if abs(self._has[worst]) <= FOREIGN or (self._sent is not None and self._has_t - self._sent[1] <= FOLLOW_S):
@@ -330,20 +353,22 @@ class Compensator:
             if abs(has[worst]) > settings.max_offset:
                 return f'the controller applies {has[worst]:.3g} at {self.arm.names[worst]}: beyond max_offset'
         elif has is not None and known:
-            pose, away = has, np.abs(has - self._joints) if self._joints is not None else np.zeros(len(has))
+            offsets = self._kept()
+            pose, away = has - offsets, np.abs(has - self._joints) if self._joints is not None else np.zeros(len(has))
             worst = int(away.argmax())
             if away[worst] > settings.follow_error:
                 return f'{self.arm.names[worst]} is {away[worst]:.3g} from the command of the controller: follow_error'
         if self._sent is not None:
             sent, then = self._sent
-            away = np.abs((offsets if pose is None else pose) - sent).max()
+            away = np.abs((offsets if pose is None else pose + offsets) - sent).max()
             if away > settings.max_rate * (now - then):
                 return 'the controller is elsewhere than it was sent last: the rate allows for it soon'
             if known and away > FOREIGN and self._has_t - then <= FOLLOW_S:
                 return 'the controller does not yet report what it was sent last'
         self._offsets = self._wanted = self._at_joints = offsets
-        self._at_has = offsets if pose is None else pose
+        self._at_has = offsets if pose is None else pose + offsets
         self._pose, self._speaks, self._owed, self._verified = pose, True, False, self._dry
+        self._left_pose = None
         self.response.begin(offsets)
         self._anchor = self._away_t = self._held_t = None
         return ''
@@ -396,7 +421,7 @@ class Compensator:
         return why
 
     def _fall_silent(self) -> None:
-        self._speaks, self._owed = False, self.settings.takeover and not self._sums
+        self._speaks, self._owed, self._left_pose = False, self.settings.takeover or self._sums, self._pose
 
     def _stands_still(self) -> str:
         """Joints that stand still while the offsets move: nobody adds them, or a protective stop."""

@@ -716,6 +716,50 @@ def test_commands_start_at_controller_command(arm: Arm, droop: float) -> None:
     assert loop.step() <= 1.0 + 1e-9
 
 
+@pytest.mark.parametrize('disabled', [True, False])
+def test_offsets_in_a_command_outlast_silence(arm: Arm, disabled: bool) -> None:
+    """A controller that tells nothing for a while keeps them: that is said, and they are not taken for its pose."""
+    loop = Loop(arm, output='commands')
+    loop.plant.force = PAYLOAD
+    loop.run(0.4)
+    loop.compensator.enable(True)
+    loop.run(0.6)
+    loop.reports, held = False, loop.has - ELBOW
+    assert np.abs(held).max() > 1e-3
+    if disabled:
+        loop.run(0.2)
+        loop.compensator.enable(False)
+        command = loop.run(0.4)
+        assert (command.state, command.foreign, command.sends) == (State.OFF, True, False)
+        assert 'the command of the controller keeps ' in command.why
+    else:
+        loop.run(0.6)
+    np.testing.assert_allclose(loop.compensator.left, loop.has - ELBOW, atol=1e-12)
+    loop.reports = True
+    if not disabled:
+        assert loop.run(1.0).state is State.FOLLOWING
+        assert loop.error() < 1e-4
+        loop.compensator.enable(False)
+    command = loop.run(0.6)
+    assert loop.has == pytest.approx(ELBOW, abs=1e-12)
+    assert (command.state, command.foreign) == (State.OFF, False)
+    assert loop.step() <= 1.0 + 1e-9
+
+
+def test_a_command_of_somebody_else_keeps_nothing_from_here(arm: Arm) -> None:
+    loop = Loop(arm, output='commands')
+    loop.plant.force = PAYLOAD
+    loop.compensator.enable(True)
+    loop.run(1.0)
+    loop.reports = False
+    loop.compensator.enable(False)
+    loop.run(0.2)
+    loop.reports, loop.has, count = True, ELBOW + 0.02, len(loop.sent)
+    command = loop.run(0.6, ELBOW + 0.02)
+    assert (command.state, command.foreign, len(loop.sent)) == (State.OFF, False, count)
+    assert not loop.compensator.left.any()
+
+
 @pytest.mark.parametrize('output', ['commands', 'offsets'])
 def test_a_report_older_than_the_last_command_begins_nothing(arm: Arm, output: str) -> None:
     """Enabled right after a release, it would begin there, and creep by as much each time."""
