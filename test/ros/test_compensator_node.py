@@ -6,6 +6,7 @@ import copy
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -317,14 +318,22 @@ sys.exit(main())
 
 
 @pytest.mark.slow
-def test_a_gate_that_fails_on_the_way_out_leaves_no_offset(domain: int, peer: Any) -> None:
+@pytest.mark.parametrize(
+    'program',
+    [(sys.executable, '-c', OUT_OF_MEMORY), ('sh', '-c', 'exec "$@" 2> /dev/full', 'sh', *PSD_DEFLECTION)],
+    ids=['no memory', 'full log'],
+)
+def test_a_way_out_without_memory_or_log_leaves_no_offset(program: list[str], domain: int, peer: Any) -> None:
     plant = Plant(peer.node)
-    node = Program([sys.executable, '-c', OUT_OF_MEMORY, *ARGUMENTS, '--stale', STALE])
+    node = Program([*program, *ARGUMENTS, '--stale', STALE])
     try:
         peer.until(lambda: plant.error() > 2e-3, 'a deflection')
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
         peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
-        peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
+        if program[0] == 'sh':
+            node.process.send_signal(signal.SIGINT)
+        else:
+            peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
         peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
         assert plant.step() <= WITHIN
     finally:
