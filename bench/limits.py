@@ -38,13 +38,13 @@ from psd_deflection.model.simulation.loads import load_history
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.conversion import Beside, convert
+from psd_deflection.recordings.observation import read_observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, FloatArray, RawChunk
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.from_recordings import read_observation
 
 READ_FRAMES = 18  # Frames of one read: the reader waits until a block is nearly whole.
 

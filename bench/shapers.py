@@ -11,7 +11,7 @@ from bench.simulated_arm import LAG_S, SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked
 from psd_deflection.arms.inputs import standing
-from psd_deflection.arms.shapers import KINDS, Shaper, shaper
+from psd_deflection.model.link.shapers import KINDS, Shaper, shaper
 from tools.program import ROOT
 
 FREQUENCY, RATIO = 12.0, 0.02

@@ -13,9 +13,9 @@ import yaml
 from blind.campaign import options, over
 from blind.cases import Case
 from blind.run import observe, seal, selection
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import CHANNELS
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.discover.observation import Observation
 
 LOADS = ('load_fx', 'load_fy', 'load_tz')
 

@@ -17,9 +17,9 @@ import numpy as np
 from blind import generator, law_forms
 from blind.campaign import bound_line, conclude, options, over
 from blind.cases import designs, gap_of
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
 

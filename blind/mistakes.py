@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from blind.generator import Array, Generator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.studies.discover.observation import Observation
 
 LENGTH = 0.585  # m, of the rig file.
 

@@ -13,11 +13,11 @@ import numpy as np
 from blind.campaign import conclude, options, over
 from blind.cases import DRAWS, EFFECTS, gap_of, scaled
 from blind.generator import Array, Generator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, proposals
 from psd_deflection.studies.discover.loop import run_loop
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan
 
 RIG = load_rig()

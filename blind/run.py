@@ -16,9 +16,9 @@ from blind import byhand, score
 from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, possible, scaled, short_cases
 from blind.mistakes import observed
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
 

@@ -239,10 +239,10 @@ def check(recording: Recording | str | Path, rig: Rig | str | Path | None = None
     Raises :class:`psd_deflection.base.errors.RecordingError` if it has no loads, and
     :class:`~psd_deflection.base.errors.ConfigError`.
     """
+    from psd_deflection.recordings.observation import read_observation
     from psd_deflection.rig.wiring import Wiring
     from psd_deflection.studies.check.checkup import check as of_problem
     from psd_deflection.studies.check.checkup import of_recording
-    from psd_deflection.studies.discover.from_recordings import read_observation
     from psd_deflection.studies.study import opened
 
     given = opened(recording, rig)

@@ -1,14 +1,12 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm's node may believe of a message: joint positions, a deflection. Each check gives the reason why not."""
+"""What an arm's node may believe of a message: joint positions. Each check gives the reason why not."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
-
-import numpy as np
 
 LARGEST_POSITION = 1e4
 """Bound of a joint's position, rad or m: a number beyond it is no position."""
@@ -18,8 +16,6 @@ KNOWN_S = 0.5
 """For so long the position of a joint is known after it was told, s."""
 REST_S = 0.1
 """The speed of a joint is that over at least this time, s: noise of its encoder is no motion."""
-UNIT_WITHIN = 1e-3
-"""How far the length of a quaternion may be from 1."""
 
 
 def joints_fault(names: Sequence[str], positions: Sequence[float], ours: Collection[str]) -> str:
@@ -103,21 +99,3 @@ class KnownJoints:
 
     def __len__(self) -> int:
         return len(self._reported)
-
-
-def quaternion_fault(quaternion: Sequence[float]) -> str:
-    """Why (x, y, z, w) is no rotation; '' if it is one."""
-    length = math.sqrt(math.fsum(v * v for v in quaternion)) if np.all(np.abs(quaternion) < 2.0) else math.nan
-    return '' if abs(length - 1.0) <= UNIT_WITHIN else 'its orientation is no unit quaternion'
-
-
-def stamp_fault(seconds: int, nanoseconds: int) -> str:
-    """Why a stamp is none; '' if it is one."""
-    if seconds < 0 or not 0 <= nanoseconds < 1_000_000_000:
-        return f'stamp {seconds} s {nanoseconds} ns: is no time'
-    return ''
-
-
-def frame_fault(frame: str, wanted: str) -> str:
-    """Why ``frame`` is not the frame that is ``wanted``; '' if it is, or if it is not given."""
-    return '' if frame in ('', wanted) else f'frame_id {frame!r}: must be {wanted}'

@@ -1,9 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Loads code of other packages: whatever it does on import, the caller gets one error that names it or its extra."""
+"""Loads code of other packages: whatever it does on import, the caller gets one error that names it or its extra. Finds
+modules of our own optional rooms."""
 
+import importlib
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from psd_deflection.base.errors import ConfigError
 
@@ -19,6 +21,16 @@ def loaded(what: str, load: Callable[[], T]) -> T:
     except (Exception, SystemExit, GeneratorExit) as error:
         # A plug-in that exits must not take the program along, with a status that means something else.
         raise ConfigError(f'{what} ({type(error).__name__}: {error})') from error
+
+
+def optional(module: str) -> Any:
+    """The ``module`` of an optional room; None if this installation has no such room."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f'{module}.'.startswith(f'{error.name}.'):
+            raise
+        return None
 
 
 EXTRAS = {

@@ -16,18 +16,10 @@ from psd_deflection.base.errors import SomeFailedError, UsageError
 from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import make_folder, make_writable
 from psd_deflection.cli._report import print_json, save_all, show, show_text, warn
-from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
+from psd_deflection.recordings.write.parquet import ENDING, ERROR, Field, ParquetFile, is_parquet
 from psd_deflection.run.fleet.tasks import FORMS, SERIAL, Outcome, check_engine, is_plain, listed, open_engine, outcomes
 
 T = TypeVar('T')
-
-ERROR = Field('error', str)
-"""Column of a table with one row a recording: why it failed, else empty."""
-
-
-def recordings_argument(parser: argparse.ArgumentParser, what: str, nargs: str = '+') -> None:
-    """Add REC..., ``what`` each is."""
-    parser.add_argument('recordings', metavar='REC', nargs=nargs, help=what)
 
 
 def executor_option(parser: argparse.ArgumentParser) -> None:
@@ -75,11 +67,6 @@ def each_for_itself(args: argparse.Namespace) -> list[str] | None:
 def _paths(words: Sequence[str]) -> list[str]:
     # Workers may run in another folder.
     return list(dict.fromkeys(os.path.abspath(name) for name in listed(words)))  # noqa: PTH100 - links stay as they are
-
-
-def absolute(path: str | None) -> str | None:
-    """``path`` for workers that run in another folder."""
-    return None if path is None else os.path.abspath(path)  # noqa: PTH100 - links stay as they are
 
 
 def folders_of(names: Sequence[str], out: Path) -> dict[str, Path]:

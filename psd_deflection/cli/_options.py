@@ -19,11 +19,11 @@ from psd_deflection.base.text import plain_number
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.recordings.formats.format import formats
 from psd_deflection.recordings.spans import FULL, MARK_WORD, Bound
+from psd_deflection.recordings.write.parquet import ENDING, is_parquet
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.rig.parameters import Parameter, Section, Value, check_value
-from psd_deflection.run.fleet.parquet import ENDING, is_parquet
 from psd_deflection.run.realtime import SHARED_MEMORY, shared_memory_left
 
 _FOREIGN = """
@@ -119,6 +119,14 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
     with given_as_option():
         rig_from_values(values, 'command line')
     return values
+
+
+def foxglove_option(parser: argparse._ActionsContainer) -> None:
+    """Add --foxglove, where that server is installed."""
+    if importlib.util.find_spec('psd_deflection.run.monitor.foxglove') is not None:
+        parser.add_argument(
+            '--foxglove', action='store_true', help='serve the messages to Foxglove as well, and print the address'
+        )
 
 
 DEMO = 'without a port: weights hang on the simulated rig in turn, so that there is motion to look at'

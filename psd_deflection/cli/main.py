@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 # Our matrices are small, or tall and narrow: more threads spin more than they compute. Before numpy is imported.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
-COMMANDS: dict[str, str] = {
+_SUMMARIES: dict[str, str] = {
     'estimator': 'acquire, estimate, publish on ROS 2 and record (the daemon)',
     'chain': 'several links in series: the deflection of the end effector',
     'compensator': 'joint offsets that put a deflected end effector back (a ROS node)',
@@ -80,7 +80,20 @@ COMMANDS: dict[str, str] = {
     'params': 'list every parameter with unit, bounds and default',
     'completion': 'print a completion script for bash, zsh or tcsh',
 }
-"""Command name to one-line summary; the module is ``NAME.py`` (``-`` as ``_``) in ``cli`` or one of ``FOLDERS``."""
+
+FOLDERS = ('', 'run', 'recordings', 'studies')
+"""Where commands lie: in ``cli`` itself and in folders of it."""
+
+_HERE = Path(__file__).parent
+_FILES = {
+    file.partition('.')[0]
+    for folder in FOLDERS
+    for file in os.listdir(_HERE / folder)  # noqa: PTH208 - every start
+}
+
+COMMANDS = {name: summary for name, summary in _SUMMARIES.items() if name.replace('-', '_') in _FILES}
+"""Command name to one-line summary; the module is ``NAME.py`` (``-`` as ``_``) in one of ``FOLDERS``. An optional room
+that is not there has none."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     'run': ('estimator', 'monitor', 'chain', 'echo', 'zero', 'load', 'mark', 'record'),
@@ -94,9 +107,6 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 PLUG_INS = ('psd_deflection.commands', 'psd_deflection.studies')
 """Groups of entry points by which other packages add a command: a module, or the function of a study."""
-
-FOLDERS = ('run', 'recordings', 'studies')
-"""Where commands lie, beside ``cli`` itself."""
 
 ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 """What ROS 2 takes behind --ros-args and people type without it."""
@@ -138,7 +148,8 @@ class _Help(argparse.RawDescriptionHelpFormatter):
             'plug-ins': [name for name in names if name not in COMMANDS],
         }
         wide = max(map(len, GROUPS)) + 4
-        lines = [(f'  {title}'.ljust(wide), group) for title, group in {**GROUPS, **others}.items() if group]
+        ours = {title: [name for name in group if name in COMMANDS] for title, group in GROUPS.items()}
+        lines = [(f'  {title}'.ljust(wide), group) for title, group in {**ours, **others}.items() if group]
         return ''.join(
             textwrap.fill(', '.join(g), self._width, initial_indent=t, subsequent_indent=' ' * wide) + '\n'
             for t, g in lines
@@ -197,16 +208,10 @@ def make_parser(
 
 
 def module_of(name: str) -> ModuleType:
-    """The module of a command: in one of the folders, or beside this file."""
+    """The module of a command, one of ``COMMANDS``."""
     file = name.replace('-', '_')
-    for folder in FOLDERS:
-        path = f'psd_deflection.cli.{folder}.{file}'
-        try:
-            return importlib.import_module(path)
-        except ModuleNotFoundError as error:
-            if error.name != path:
-                raise
-    return importlib.import_module(f'psd_deflection.cli.{file}')
+    folder = next(folder for folder in FOLDERS if (_HERE / folder / f'{file}.py').exists())
+    return importlib.import_module('.'.join(filter(None, ('psd_deflection.cli', folder, file))))
 
 
 def _plug_in(point: EntryPoint) -> Any:

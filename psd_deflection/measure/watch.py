@@ -94,6 +94,12 @@ class Alarm:
         )
 
 
+def alarm_sentences(alarms: Sequence[Alarm], start_ns: int, watched: str) -> list[str]:
+    """Each alarm with its time from ``start_ns``; or that there was none, and what was ``watched``."""
+    lines = [f'since {(alarm.since_ns - start_ns) / 1e9:.1f} s: {alarm.words}' for alarm in alarms]
+    return lines or [f'the rig is its model; watched: {watched}']
+
+
 class _Window(NamedTuple):
     mean: float
     scatter: float

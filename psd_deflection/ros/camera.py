@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, to_messages
-from psd_deflection.arms.inputs import stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.camera.answer import FrameAnswer, Status
@@ -23,6 +22,7 @@ from psd_deflection.camera.target import target_of
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, ReferencePose
 from psd_deflection.ros.declared import DeclaredParameters
+from psd_deflection.ros.gate import stamp_fault
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE

@@ -38,13 +38,13 @@ from psd_deflection.arms.compensation.compensator import Command, Compensator, O
 from psd_deflection.arms.compensation.robot import RobotWatch
 from psd_deflection.arms.compensation.settings import ALL_JOINTS, SETTINGS, CompensatorSettings
 from psd_deflection.arms.compensation.settings import COMMANDS as WITH_COMMANDS
-from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fault, quaternion_fault, stamp_fault
+from psd_deflection.arms.inputs import LARGEST_POSITION, joints_fault
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.records import FloatArray
 from psd_deflection.ros.declared import DeclaredParameters, given_of
 from psd_deflection.ros.endpoints import message_class
-from psd_deflection.ros.gate import robot_description
+from psd_deflection.ros.gate import frame_fault, quaternion_fault, robot_description, stamp_fault
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import (

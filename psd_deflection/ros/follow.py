@@ -14,11 +14,12 @@ from rclpy.clock import Clock, ClockType
 from trajectory_msgs.msg import JointTrajectory
 
 from psd_deflection.arms.compensation.trajectory import JointsError, MovingError, OldStampError, TrajectoryShaper
-from psd_deflection.arms.inputs import LONGEST_LIST, stamp_fault
+from psd_deflection.arms.inputs import LONGEST_LIST
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING
 from psd_deflection.ros.declared import SOURCE
 from psd_deflection.ros.endpoints import OF_RCLPY
+from psd_deflection.ros.gate import stamp_fault
 from psd_deflection.ros.node import BaseNode
 from psd_deflection.ros.topics import FOLLOW
 

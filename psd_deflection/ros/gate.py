@@ -4,10 +4,12 @@
 cannot be used is rejected, counted and said once. No message ends a node."""
 
 import functools
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from rclpy.action import GoalResponse
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
@@ -43,6 +45,8 @@ NEWS = 3
 """Rejections of a topic that are said one by one, before they are counted and said together."""
 MOST_A_SECOND = 2000
 """Messages of one topic that are looked at within a second."""
+UNIT_WITHIN = 1e-3
+"""How far the length of a quaternion may be from 1."""
 
 
 class InputGate:
@@ -286,3 +290,21 @@ def robot_description(
 
 def _fault(message: Any) -> str:
     return '' if message.data.strip() else 'it is empty'
+
+
+def quaternion_fault(quaternion: Sequence[float]) -> str:
+    """Why (x, y, z, w) is no rotation; '' if it is one."""
+    length = math.sqrt(math.fsum(v * v for v in quaternion)) if np.all(np.abs(quaternion) < 2.0) else math.nan
+    return '' if abs(length - 1.0) <= UNIT_WITHIN else 'its orientation is no unit quaternion'
+
+
+def stamp_fault(seconds: int, nanoseconds: int) -> str:
+    """Why a stamp is none; '' if it is one."""
+    if seconds < 0 or not 0 <= nanoseconds < 1_000_000_000:
+        return f'stamp {seconds} s {nanoseconds} ns: is no time'
+    return ''
+
+
+def frame_fault(frame: str, wanted: str) -> str:
+    """Why ``frame`` is not the frame that is ``wanted``; '' if it is, or if it is not given."""
+    return '' if frame in ('', wanted) else f'frame_id {frame!r}: must be {wanted}'

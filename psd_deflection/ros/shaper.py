@@ -14,13 +14,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from psd_deflection.arms.compensation.arm import limits_of
 from psd_deflection.arms.compensation.settings import DESCRIPTION, SHAPING, ShaperSettings, trajectory_shaper
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory, checked, start_of
-from psd_deflection.arms.inputs import KnownJoints, joints_fault, stamp_fault
+from psd_deflection.arms.inputs import KnownJoints, joints_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.base.text import sanitize
 from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.follow import Follower
-from psd_deflection.ros.gate import listen_to_description
+from psd_deflection.ros.gate import listen_to_description, stamp_fault
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import JOINT_STATES, SHAPED, TRAJECTORY

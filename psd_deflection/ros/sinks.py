@@ -33,7 +33,6 @@ from msg_adapters import (
 from msg_adapters.header import stamp_ns
 from msg_adapters.orientation import quaternion
 from msg_adapters.string import to_mark
-from psd_deflection.arms.inputs import frame_fault, quaternion_fault, stamp_fault
 from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.base.log import null_log
 from psd_deflection.model.plate.layout import Vector
@@ -42,7 +41,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import Rig
 from psd_deflection.ros.endpoints import message_class, publisher_of
-from psd_deflection.ros.gate import InputGate
+from psd_deflection.ros.gate import InputGate, frame_fault, quaternion_fault, stamp_fault
 from psd_deflection.ros.topics import BASE, PSDS, PUBLISHED, RECORD, REST, TF, TF_STATIC, TIP, VOLTS, ZERO
 from psd_deflection.run.fanout import published
 from psd_deflection.run.session import Session

@@ -6,9 +6,9 @@ from collections import deque
 
 import numpy as np
 
+from psd_deflection.measure.steps import last_load_change
 from psd_deflection.records import BlockStatus, Record, SpotMeans
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.steps import last_load_change
 
 REACH_S = 60.0
 """A step that is older is not looked for."""

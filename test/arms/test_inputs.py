@@ -7,15 +7,7 @@ import math
 import pytest
 
 from psd_deflection.arms.compensation.robot import RobotWatch
-from psd_deflection.arms.inputs import (
-    KNOWN_S,
-    LONGEST_LIST,
-    KnownJoints,
-    frame_fault,
-    joints_fault,
-    quaternion_fault,
-    stamp_fault,
-)
+from psd_deflection.arms.inputs import KNOWN_S, LONGEST_LIST, KnownJoints, joints_fault
 
 
 def test_positions_are_known_for_a_while() -> None:
@@ -77,22 +69,6 @@ def test_names_of_long_ago_make_room_for_new_ones() -> None:
     known.notify(1.5 * KNOWN_S, ['late'], [0.1])
     assert list(known.measured(1.5 * KNOWN_S)) == ['late']
     assert len(known) == 1
-
-
-@pytest.mark.parametrize(
-    ('seconds', 'nanoseconds', 'right'),
-    [(0, 0, True), (5, 999_999_999, True), (-1, 5, False), (5, -1, False), (5, 1_000_000_000, False)],
-)
-def test_a_stamp_is_a_time(seconds: int, nanoseconds: int, right: bool) -> None:
-    assert (stamp_fault(seconds, nanoseconds) == '') is right
-
-
-def test_a_frame_and_a_rotation_are_what_is_wanted() -> None:
-    assert frame_fault('', 'base') == frame_fault('base', 'base') == ''
-    assert 'must be base' in frame_fault('tip', 'base')
-    assert quaternion_fault((0.0, 0.6, 0.0, 0.8)) == ''
-    for wrong in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.6, 0.0, 0.9), (math.nan, 0.0, 0.0, 1.0), (0.0, 0.0, 1e300, 0.0)):
-        assert quaternion_fault(wrong)
 
 
 def test_a_robot_of_which_nothing_is_reported_runs() -> None:

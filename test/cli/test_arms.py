@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from psd_deflection.arms.compensation.settings import SHAPING, shaper_of
-from psd_deflection.arms.shapers import Shaper, in_series, recommended, shaper
 from psd_deflection.cli._options import of_options
 from psd_deflection.cli.main import main, make_parser
+from psd_deflection.model.link.shapers import Shaper, in_series, recommended, shaper
 from tools.program import ROOT
 
 CONFIG = Path(__file__).parents[2] / 'config'

@@ -12,7 +12,7 @@ import pytest
 
 from psd_deflection.cli import _fleet
 from psd_deflection.cli.main import main
-from psd_deflection.run.fleet.parquet import FAILED
+from psd_deflection.recordings.write.parquet import FAILED
 
 pandas = pytest.importorskip('pandas')
 parquet = pytest.importorskip('pyarrow.parquet')

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gate: what is bounded before it is unpacked, and who is told that his messages do not come."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ from bench.campaign.attacked import NODES
 from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery
 from psd_deflection.base.log import INFO, WARNING
 from psd_deflection.ros.endpoints import qos
-from psd_deflection.ros.gate import MOST_A_SECOND, InputGate
+from psd_deflection.ros.gate import MOST_A_SECOND, InputGate, frame_fault, quaternion_fault, stamp_fault
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic
 from test.altered import altered
 from test.ros.test_conformance import nodes_of_setup
@@ -165,3 +166,19 @@ def test_unreliable_load_publisher_is_rejected_by_name(
 
 def test_every_node_is_attacked() -> None:
     assert set(NODES) == set(nodes_of_setup())
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'nanoseconds', 'right'),
+    [(0, 0, True), (5, 999_999_999, True), (-1, 5, False), (5, -1, False), (5, 1_000_000_000, False)],
+)
+def test_a_stamp_is_a_time(seconds: int, nanoseconds: int, right: bool) -> None:
+    assert (stamp_fault(seconds, nanoseconds) == '') is right
+
+
+def test_a_frame_and_a_rotation_are_what_is_wanted() -> None:
+    assert frame_fault('', 'base') == frame_fault('base', 'base') == ''
+    assert 'must be base' in frame_fault('tip', 'base')
+    assert quaternion_fault((0.0, 0.6, 0.0, 0.8)) == ''
+    for wrong in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.6, 0.0, 0.9), (math.nan, 0.0, 0.0, 1.0), (0.0, 0.0, 1e300, 0.0)):
+        assert quaternion_fault(wrong)

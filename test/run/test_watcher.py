@@ -18,6 +18,7 @@ from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings import cdr
+from psd_deflection.recordings.observation import read_observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed_estimates, rig_at_start
 from psd_deflection.records import AppliedLoad, DeflectionEstimate, FloatArray, RawChunk
@@ -27,7 +28,6 @@ from psd_deflection.run.diagnostics import OK, WARN, HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.session import Session
 from psd_deflection.run.watcher import Watcher, WatcherSink
-from psd_deflection.studies.discover.from_recordings import read_observation
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from psd_deflection.model.simulation.catalogue import effect_names
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.calibrate.from_recordings import with_effective_loads
@@ -15,7 +16,6 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.result import Checkup
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.report import Discovery
 
 RIG = load_rig()

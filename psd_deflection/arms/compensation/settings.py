@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from psd_deflection.arms.compensation.arm import read_limits
 from psd_deflection.arms.compensation.trajectory import TrajectoryShaper
-from psd_deflection.arms.shapers import KINDS, Shaper, in_series, recommended, shaper
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link.shapers import KINDS, Shaper, in_series, recommended, shaper
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.rig.parameters import Section, check_value, parameter

@@ -16,8 +16,8 @@ from scipy.interpolate import PPoly
 
 from psd_deflection.arms.compensation.arm import JointLimits
 from psd_deflection.arms.inputs import MeasuredJoint
-from psd_deflection.arms.shapers import Shaper
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link.shapers import Shaper
 from psd_deflection.records import FloatArray
 
 MOST_POINTS = 10_000

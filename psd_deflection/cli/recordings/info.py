@@ -21,15 +21,7 @@ from typing import Any
 
 from msg_adapters import SAMPLES
 from psd_deflection.base.text import sanitize
-from psd_deflection.cli._fleet import (
-    ERROR,
-    executor_option,
-    notify_each,
-    recordings_argument,
-    run_each,
-    several,
-    write_rows,
-)
+from psd_deflection.cli._many import FLEET, executor_option, recordings_argument, several
 from psd_deflection.cli._options import namespace_option, parquet_name, span_options
 from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show
@@ -39,7 +31,7 @@ from psd_deflection.recordings.read.references import described, is_table
 from psd_deflection.recordings.recording import EPOCH_FROM_NS
 from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.summary import summary
-from psd_deflection.run.fleet.parquet import Field, ParquetFile
+from psd_deflection.recordings.write.parquet import ERROR, Field, ParquetFile
 
 FIELDS = (
     ERROR,
@@ -72,8 +64,9 @@ HEAD = ('state', 'seconds', 'samples', 'lost', 'flagged', 'rate (1/s)', 'lacks')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    recordings_argument(parser, 'a bag folder, an .mcap or a .csv; a pattern or a .txt list of them')
-    parser.add_argument('--out', metavar='X.parquet', type=parquet_name, help='write a row a recording')
+    recordings_argument(parser, 'a bag folder, an .mcap or a .csv')
+    if FLEET:
+        parser.add_argument('--out', metavar='X.parquet', type=parquet_name, help='write a row a recording')
     span_options(parser)
     namespace_option(parser)
     executor_option(parser)
@@ -114,10 +107,11 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
     found: dict[str, dict[str, Any]] = {}
     with contextlib.ExitStack() as stack:
         out = None if args.out is None else stack.enter_context(ParquetFile(args.out, FIELDS))
-        failed = run_each(args, names, partial(summary_of, namespace=args.namespace, span=args.span), found.__setitem__)
+        work = partial(summary_of, namespace=args.namespace, span=args.span)
+        failed = FLEET.run_each(args, names, work, found.__setitem__)
         if out is not None:
-            write_rows(out, names, {name: _row(one) for name, one in found.items()}, failed)
-    notify_each(args, names, found, failed, HEAD, _line)
+            FLEET.write_rows(out, names, {name: _row(one) for name, one in found.items()}, failed)
+    FLEET.notify_each(args, names, found, failed, HEAD, _line)
     return 0
 
 

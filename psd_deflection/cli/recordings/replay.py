@@ -36,12 +36,13 @@ from psd_deflection.base.axes import ranges
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
 from psd_deflection.base.tables import Column
-from psd_deflection.cli._fleet import absolute, executor_option, notify_each, recordings_argument, run_each, several
+from psd_deflection.cli._many import FLEET, absolute, executor_option, recordings_argument, several
 from psd_deflection.cli._options import namespace_option, parameter_option, recording_name, reject, span_options
 from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.watch import alarm_sentences
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.formats.format import Sink
 from psd_deflection.recordings.recording import Recording, RecordingWindow
@@ -55,12 +56,11 @@ from psd_deflection.recordings.replay.engine import (
     warnings_about_rig,
 )
 from psd_deflection.recordings.spans import Span
+from psd_deflection.recordings.write.parquet import ENDING, Field, ParquetFile, is_parquet
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.alarm_out import AlarmOut
-from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
-from psd_deflection.studies.watch.result import WatchedRun
 
 DIFFERS = 1
 END_S = 60.0
@@ -70,7 +70,7 @@ HEAD = ('state', 'seconds', 'samples', 'lost', 'blocks', 'estimates', 'rejected'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    recordings_argument(parser, 'a bag folder, an .mcap or a .csv; a pattern or a .txt list of them')
+    recordings_argument(parser, 'a bag folder, an .mcap or a .csv')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
     )
@@ -215,8 +215,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _watch_lines(watched: WatchedReplay, first_ns: int) -> list[str]:
-    found = WatchedRun(tuple(watched.alarms), str(watched.watch.state), first_ns, {})
-    return [f'  watch: {sentence}' for sentence in found.sentences()]
+    found = alarm_sentences(watched.alarms, first_ns, str(watched.watch.state))
+    return [f'  watch: {sentence}' for sentence in found]
 
 
 def _alarm_out(args: argparse.Namespace, recording: Recording) -> AlarmOut:
@@ -314,10 +314,10 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
             compare=args.compare,
             columns=args.out is not None,
         )
-        failed = run_each(args, names, work, take)
+        failed = FLEET.run_each(args, names, work, take)
         if out is not None:
             out.close(failed)
-    notify_each(args, names, found, failed, HEAD, partial(_line, strict=args.strict))
+    FLEET.notify_each(args, names, found, failed, HEAD, partial(_line, strict=args.strict))
     differs = args.compare and not all(_agrees(_counts(one), args.strict) for one in found.values())
     return DIFFERS if differs else 0
 

@@ -22,7 +22,15 @@ from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import DEMO, given_parameters, over_file, parameter_option, reject_demo, require_ros
+from psd_deflection.cli._options import (
+    DEMO,
+    foxglove_option,
+    given_parameters,
+    over_file,
+    parameter_option,
+    reject_demo,
+    require_ros,
+)
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.model.solvers.registry import SOLVERS, check_live
@@ -55,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
     parameter_option(parser, '--monitor-port', 'monitor_port')
     parameter_option(parser, '--monitor-address', 'monitor_address')
-    parser.add_argument('--foxglove', action='store_true', help='serve the messages to Foxglove and print the address')
+    foxglove_option(parser)
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
     parser.add_argument(
         '--ros-args', action='store_true', help='arguments after this go to ROS (ros2 run, ros2 launch)'

@@ -29,6 +29,7 @@ from psd_deflection.base.text import plain_number
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import (
     DEMO,
+    foxglove_option,
     given_parameters,
     namespace_option,
     over_file,
@@ -49,7 +50,7 @@ from psd_deflection.run.headless import run_headless
 from psd_deflection.run.monitor.feed import Feed
 from psd_deflection.run.monitor.served import need_server
 from psd_deflection.run.monitor.shown_recording import ShownRecording
-from psd_deflection.run.monitor.start import start_views
+from psd_deflection.run.monitor.start import foxglove, start_views
 from psd_deflection.run.simulated_rig import simulates, started_early
 
 
@@ -72,9 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     control.add_argument(
         '--no-control', dest='monitor_control', action='store_const', const='off', help='switch the buttons off'
     )
-    page.add_argument(
-        '--foxglove', action='store_true', help='serve the messages to Foxglove as well, and print the address'
-    )
+    foxglove_option(page)
     live = parser.add_argument_group('the rig (without REC)')
     parameter_option(live, '--port', 'port')
     parameter_option(live, '--baud', 'baud')
@@ -118,7 +117,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
-    from psd_deflection.run.monitor.foxglove import FeedBeside, FoxgloveServer
     from psd_deflection.run.monitor.server import MonitorServer
 
     opened, rig = open_for_replay(args.recording, args.params_file, args.namespace)
@@ -140,8 +138,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     display = Display()
-    foxglove = FoxgloveServer(rig, display.log) if rig.monitor.foxglove else None
-    feed = Feed() if foxglove is None else FeedBeside(foxglove, rig)
+    beside = foxglove().FoxgloveServer(rig, display.log) if rig.monitor.foxglove else None
+    feed = Feed() if beside is None else foxglove().FeedBeside(beside, rig)
     server: MonitorServer | None = None
 
     def log(text: str, level: int = INFO, /) -> None:
@@ -167,8 +165,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     )
     server = MonitorServer(shown, feed, rig.monitor, display.log)
     server.start()
-    if foxglove is not None:
-        display.log(foxglove.words())
+    if beside is not None:
+        display.log(beside.words())
     try:
         shown.start()
         while not stop.wait(0.1) and shown.failed is None:
@@ -176,8 +174,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     finally:
         shown.close()
         server.close()
-        if foxglove is not None:
-            foxglove.close()
+        if beside is not None:
+            beside.close()
     if shown.failed is not None:
         raise shown.failed
     return 0

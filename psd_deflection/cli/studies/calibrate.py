@@ -41,15 +41,7 @@ from tqdm import tqdm
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, UsageError
 from psd_deflection.cli._daemon import url_option
-from psd_deflection.cli._fleet import (
-    ERROR,
-    TaskResult,
-    absolute,
-    answer_each,
-    each_for_itself,
-    each_option,
-    recordings_argument,
-)
+from psd_deflection.cli._many import FLEET, absolute, each_for_itself, each_option
 from psd_deflection.cli._options import make_writable, namespace_option, reject, span_options
 from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import print_json, save_all, show, warn
@@ -58,9 +50,9 @@ from psd_deflection.cli.studies._calibrate_live import calibrate_live
 from psd_deflection.model.misalignment.rig import is_calibrated
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.recordings.spans import FULL
+from psd_deflection.recordings.write.parquet import ERROR, Field
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import with_values
-from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.calibrate import check as checking
 from psd_deflection.studies.calibrate.dark import (
     DarkLevel,
@@ -83,7 +75,7 @@ HEAD = ('state', 'by', 'undetermined', 'heldout before (um)', 'after')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    recordings_argument(parser, 'recordings with a reference or with known loads', '*')
+    parser.add_argument('recordings', metavar='REC', nargs='*', help='recordings with a reference or with known loads')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
@@ -215,8 +207,8 @@ def _answer(args: argparse.Namespace, found: Calibrated, files: Mapping[str, str
     return 0
 
 
-def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
-    """The task for one of many recordings."""
+def answer_of(path: str, asked: CalibrationOptions) -> Any:
+    """The task for one of many recordings; its TaskResult."""
     warnings: list[str] = []
     rig = asked.rig([path], warnings.append)
     answer = asked.calibrated(asked.runs([path], rig), rig, (), lambda words: None, warnings.append)
@@ -231,7 +223,7 @@ def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
         **{f'sd {name}': one['sd'] for name, one in tree['parameters'].items()},
         'result': files[answer.json_name],
     }
-    return TaskResult(files, cells, warnings)
+    return FLEET.TaskResult(files, cells, warnings)
 
 
 def _fields() -> list[Field]:
@@ -258,7 +250,8 @@ def _each(args: argparse.Namespace, names: list[str], asked: CalibrationOptions)
     if args.params_file is not None:
         # What is wrong in it is so for all.
         load_rig(args.params_file)
-    return answer_each(args, names, partial(answer_of, asked=asked), _fields(), HEAD, _line)
+    answered: int = FLEET.answer_each(args, names, partial(answer_of, asked=asked), _fields(), HEAD, _line)
+    return answered
 
 
 def _line(cells: Mapping[str, Any]) -> list[str]:

@@ -36,6 +36,7 @@ from psd_deflection.cli._options import (
 from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import LONGEST_LINE, show
 from psd_deflection.cli.studies._answer import answer, answer_arguments
+from psd_deflection.recordings.observation import read_observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.recordings.spans import FULL
@@ -46,7 +47,6 @@ from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.guide import Guide
 from psd_deflection.studies.check.result import Checkup
 from psd_deflection.studies.check.wirings import DOTS
-from psd_deflection.studies.discover.from_recordings import read_observation
 
 BAR = 12
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.plugins import optional
 from psd_deflection.base.tables import columns
 from psd_deflection.base.text import plain_number
 from psd_deflection.cli._options import PICTURES, need_folder, picture_name, reject
@@ -35,9 +36,7 @@ from psd_deflection.model.plate import placement
 from psd_deflection.model.plate.linear import condition_number, design_matrix
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig
-from psd_deflection.studies import splitter
-from psd_deflection.studies.budget.budget import default_load
-from psd_deflection.studies.thesis import scaling
+from psd_deflection.studies import scaling, splitter
 
 TILTED = np.array([0.0, 0.0, 0.0, math.radians(0.3), math.radians(0.1)])
 """Where observability of tilt is stated: φ 0.3 deg, ω 0.1 deg. At rest coplanar sensors see none."""
@@ -120,8 +119,9 @@ def run(args: argparse.Namespace) -> int:
     show_text(placement_text(candidates, sigma))
     show()
     show_text(tilt_text(rig, radius, sigma))
-    show()
-    show_text(tied_text(rig, candidates[-1].centers, sigma))
+    if budget := optional('psd_deflection.studies.budget.budget'):
+        show()
+        show_text(tied_text(rig, candidates[-1].centers, sigma, budget.default_load(rig)))
     if args.out is not None:
         show('', args.out)
     return 0
@@ -340,10 +340,9 @@ def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
     )
 
 
-def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
-    """What two sensors tell of the slope ratio k once the tilts are tied to the deflection."""
+def tied_text(rig: Rig, best: FloatArray, sigma: float, load: tuple[float, float, float]) -> str:
+    """What two sensors tell of the slope ratio k under ``load`` once the tilts are tied to the deflection."""
     link = rig.link
-    load = default_load(rig)
     pose = np.array(LinkStatics.from_rig(rig).deflection(*load))
     stagger = np.array([0.05, -0.05])
     # Across the bending direction heights tell nothing of k: the best pair is turned into it.

@@ -46,15 +46,7 @@ from tqdm import tqdm
 
 from psd_deflection.base.errors import ConfigError, UsageError
 from psd_deflection.base.text import plain_number
-from psd_deflection.cli._fleet import (
-    ERROR,
-    TaskResult,
-    absolute,
-    answer_each,
-    each_for_itself,
-    each_option,
-    recordings_argument,
-)
+from psd_deflection.cli._many import FLEET, absolute, each_for_itself, each_option
 from psd_deflection.cli._options import (
     in_the_world,
     make_writable,
@@ -69,18 +61,18 @@ from psd_deflection.cli._values import given_as_option, integer, seed
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names, with_effects
 from psd_deflection.model.simulation.loads import load_history
+from psd_deflection.recordings.observation import Observation, read_observation
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRun
 from psd_deflection.recordings.spans import FULL
+from psd_deflection.recordings.write.parquet import ERROR, Field
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.discover.conclusion import adopting_folder
 from psd_deflection.studies.discover.experiment import Limits
-from psd_deflection.studies.discover.from_recordings import DiscoverOptions, read_observation
+from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LISTED, SCRIPT, LoopResult, planned, recorded_name, run_loop
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
@@ -237,7 +229,7 @@ HEAD = ('verdict', 'effects', 'gap before (um)', 'after', 'floor')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    recordings_argument(parser, 'recordings, or .yaml lists of them', nargs='*')
+    parser.add_argument('recordings', metavar='REC', nargs='*', help='recordings, or .yaml lists of them')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
@@ -401,8 +393,8 @@ def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str
     return hints
 
 
-def answer_of(path: str, asked: DiscoverOptions) -> TaskResult:
-    """The task for one of many recordings."""
+def answer_of(path: str, asked: DiscoverOptions) -> Any:
+    """The task for one of many recordings; its TaskResult."""
     warnings: list[str] = []
     found = asked.discovered(asked.read([path], warnings.append), notify=warnings.append)
     files = found.files()
@@ -419,13 +411,14 @@ def answer_of(path: str, asked: DiscoverOptions) -> TaskResult:
         'simulations': found.simulations,
         'result': files['result.json'],
     }
-    return TaskResult(files, cells, warnings)
+    return FLEET.TaskResult(files, cells, warnings)
 
 
 def _each(args: argparse.Namespace, names: list[str], asked: DiscoverOptions) -> int:
     if args.adopt is not None:
         raise UsageError(f'--adopt {args.adopt}: not with --each, which may find many laws; adopt one by itself')
-    return answer_each(args, names, partial(answer_of, asked=asked), FIELDS, HEAD, _line)
+    answered: int = FLEET.answer_each(args, names, partial(answer_of, asked=asked), FIELDS, HEAD, _line)
+    return answered
 
 
 def _line(cells: Mapping[str, Any]) -> list[str]:

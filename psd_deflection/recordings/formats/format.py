@@ -85,7 +85,7 @@ GROUP = 'psd_deflection.formats'
 HEAD = 64
 """Bytes by which a file is recognised."""
 
-FORMATS = ('csv', 'mcap', 'rerun', 'bag')
+FORMATS = tuple(name for name in ('csv', 'mcap', 'rerun', 'bag') if Path(__file__).with_name(f'{name}.py').exists())
 """Modules of this folder with a ``FORMAT``, in the order in which they are asked."""
 
 FOLDER = 'bag'

@@ -3,21 +3,26 @@
 """Keeps the page's history of a week in an SQLite file per device, written once a minute by a thread of its own. A
 damaged file is put aside; nothing that the disk does reaches the page or the run."""
 
+from __future__ import annotations
+
+import asyncio
 import contextlib
 import json
 import queue
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Coroutine, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from psd_deflection.base.log import WARNING, LogCallback
-from psd_deflection.run.monitor.history import KEPT_LEVEL, LEVELS, MOST_MARKS, History, Kept
+from psd_deflection.run.monitor.history import KEPT_LEVEL, LEVELS, MOST_MARKS, History, Kept, asked
 
 VERSION = 1
+KEEP_EVERY_S, RESTORE_S = 60.0, 0.1
 END_S = 1.0
 """The end of a run waits so long for the disk."""
 BUSY_S = 5.0
@@ -27,6 +32,49 @@ _TABLES = """
 CREATE TABLE IF NOT EXISTS cells (key INTEGER PRIMARY KEY, cell BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS marks (t_ns INTEGER NOT NULL, content TEXT NOT NULL);
 """
+
+
+class PageHistory:
+    """The history of a page, of ``psds`` and blocks of ``block_size``; kept in the file ``path`` if there is one.
+
+    ``log`` gets a line if that fails. :meth:`jobs` keep it; all else is called by the thread that runs them.
+    """
+
+    def __init__(self, psds: int, block_size: int, path: Path | None, log: LogCallback) -> None:
+        self._history = History(psds, block_size)
+        self._keeper = None if path is None else HistoryKeeper(path, self._history, log)
+        self.add, self.mark = self._history.add, self._history.mark
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the cells."""
+        return self._history.bytes
+
+    def answer(self, query: Mapping[str, str]) -> str:
+        """The JSON of the window that the parameters of a request name. Raises AskedError, a ValueError."""
+        return self._history.answer(asked(query))
+
+    def start(self) -> None:
+        """Begin to read what was kept."""
+        if self._keeper is not None:
+            self._keeper.start()
+
+    def end(self) -> None:
+        """Save what is new; a second call does nothing."""
+        keeper, self._keeper = self._keeper, None
+        if keeper is not None:
+            keeper.end()
+
+    def jobs(self) -> list[Coroutine[Any, Any, None]]:
+        """What restores and saves; none if no file is given."""
+        return [] if self._keeper is None else [self._keep(self._keeper)]
+
+    async def _keep(self, keeper: HistoryKeeper) -> None:
+        while not keeper.restore():
+            await asyncio.sleep(RESTORE_S)
+        while True:
+            await asyncio.sleep(KEEP_EVERY_S)
+            keeper.save()
 
 
 class HistoryFile:

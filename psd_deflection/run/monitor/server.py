@@ -19,6 +19,7 @@ from aiohttp import web
 from psd_deflection import __version__
 from psd_deflection.base import charts
 from psd_deflection.base.log import INFO, LogCallback
+from psd_deflection.base.plugins import optional
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import (
     AppliedLoad,
@@ -34,8 +35,6 @@ from psd_deflection.rig.running import MonitorConfig
 from psd_deflection.run.monitor import gated, metrics
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
-from psd_deflection.run.monitor.history import AskedError, History, asked
-from psd_deflection.run.monitor.kept_history import HistoryKeeper
 from psd_deflection.run.monitor.served import (
     MAX_AGO_S,
     SINCE_STEP,
@@ -49,13 +48,14 @@ from psd_deflection.run.monitor.shown import PageCalibration, RejectedError, Sho
 from psd_deflection.run.monitor.spectrum import Spectrum, density_json, line_entry
 from psd_deflection.run.recorder import new_folder
 
+HISTORY = optional('psd_deflection.run.monitor.kept_history')
+"""The room that keeps the last week, or None."""
 PAGE = Path(__file__).parent / 'page'
 
 PUMP_S = 0.03
 SPECTRUM_EVERY_S = 0.5
 HEALTH_S = 0.9
 HISTORY_S = 60.0
-KEEP_EVERY_S, RESTORE_S = 60.0, 0.1
 FRESH_S = 2.0
 """A block that came longer ago, s, is in no metrics: the device is away, and a scrape may come once a minute."""
 MESSAGES = 50
@@ -101,9 +101,9 @@ class MonitorServer(GatedServer):
         self._marks: deque[str] = deque(maxlen=MARKS)
         self._mark_count = 0
         self._alarm: Alarm | None = None
-        self._history = History(len(shown.rig.psds), shown.rig.estimator.block_size)
         kept_in = shown.history_file() if config.history else None
-        self._keeper = None if kept_in is None else HistoryKeeper(kept_in, self._history, log)
+        of = shown.rig.estimator.block_size
+        self._history = HISTORY and HISTORY.PageHistory(len(shown.rig.psds), of, kept_in, log)
         self._calibration = PageCalibration()
         self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
         self._message_count = 0
@@ -121,8 +121,8 @@ class MonitorServer(GatedServer):
 
     def start(self) -> str:
         """Start the thread; return the page's address. Raises ConfigError if it cannot be served."""
-        if self._keeper is not None:
-            self._keeper.start()
+        if self._history:
+            self._history.start()
         self.url = f'http:{self.start_thread()}/'
         self._announced = announce(Served(self.url, self.token, str(self._shown.describe()['name']), os.getpid()))
         self.log(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
@@ -132,9 +132,8 @@ class MonitorServer(GatedServer):
         """Close the connections to the browsers and end the thread; a second call does nothing."""
         withdraw(self._announced)
         super().close()
-        if self._keeper is not None:
-            self._keeper.end()
-            self._keeper = None
+        if self._history:
+            self._history.end()
 
     def notify(self, text: str, level: int = INFO, /) -> None:
         """Show a message on the page; from any thread."""
@@ -146,7 +145,8 @@ class MonitorServer(GatedServer):
         application.router.add_get('/', self._index)
         application.router.add_get(self.websocket_path, self._websocket)
         application.router.add_get('/metrics', self._metrics)
-        application.router.add_get('/api/history', self._get_history)
+        if self._history:
+            application.router.add_get('/api/history', self._get_history)
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
         application.router.add_post('/api/load', self._load)
@@ -162,7 +162,7 @@ class MonitorServer(GatedServer):
 
     def jobs(self) -> list[Coroutine[Any, Any, None]]:
         """What comes from the run, and its health."""
-        keeping = [] if self._keeper is None else [self._keep_history(self._keeper)]
+        keeping = self._history.jobs() if self._history else ()
         return [self._pump(), self._once_a_second(), *keeping]
 
     # Data from the threads of the run.
@@ -174,7 +174,8 @@ class MonitorServer(GatedServer):
             for item in self._feed.take():
                 if isinstance(item, BlockResult):
                     self._rows.append(row_json(item))
-                    self._history.add(item)
+                    if self._history:
+                        self._history.add(item)
                     self._last_block, self._block_came = item, time.monotonic()
                     self._row_count += 1
                     new = True
@@ -199,7 +200,8 @@ class MonitorServer(GatedServer):
         text = mark_json(item)
         self._marks.append(text)
         self._mark_count += 1
-        self._history.mark(item.since_ns if isinstance(item, Alarm) else item.t_ns, text)
+        if self._history:
+            self._history.mark(item.since_ns if isinstance(item, Alarm) else item.t_ns, text)
 
     def _take_reference(self, reference: ReferencePose) -> bool:
         last = self._reference_ns
@@ -218,13 +220,6 @@ class MonitorServer(GatedServer):
             if self.viewers:
                 self._take_health()
             await asyncio.sleep(1.0)
-
-    async def _keep_history(self, keeper: HistoryKeeper) -> None:
-        while not keeper.restore():
-            await asyncio.sleep(RESTORE_S)
-        while True:
-            await asyncio.sleep(KEEP_EVERY_S)
-            keeper.save()
 
     def _take_health(self) -> None:
         now = time.monotonic()
@@ -267,15 +262,16 @@ class MonitorServer(GatedServer):
     async def _metrics(self, request: web.Request) -> web.StreamResponse:
         families = self._shown.metrics()
         families.append(metrics.counter('page_dropped', 'Items for which the page was too slow', self._feed.dropped))
-        families.append(metrics.memory('page_history_bytes', 'Memory of the history', self._history.bytes))
+        if self._history:
+            families.append(metrics.memory('page_history_bytes', 'Memory of the history', self._history.bytes))
         if self._last_block is not None and time.monotonic() - self._block_came < FRESH_S:
             families += metrics.of_block(self._last_block)
         return web.Response(text=metrics.text_of(families), headers={'Content-Type': metrics.CONTENT_TYPE})
 
     async def _get_history(self, request: web.Request) -> web.StreamResponse:
         try:
-            return web.Response(text=self._history.answer(asked(request.query)), content_type='application/json')
-        except AskedError as error:
+            return web.Response(text=self._history.answer(request.query), content_type='application/json')
+        except ValueError as error:
             return _answer(400, f'rejected: {error}')
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:

@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import LogCallback
+from psd_deflection.base.plugins import optional
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.monitor.feed import Feed
@@ -18,7 +21,6 @@ from psd_deflection.run.rig_publisher import RigPublisher
 from psd_deflection.run.session import Session
 
 if TYPE_CHECKING:
-    from psd_deflection.run.monitor.foxglove import FoxgloveServer
     from psd_deflection.run.monitor.server import MonitorServer
 
 
@@ -26,12 +28,12 @@ class Views:
     """What shows a session: its page, its Foxglove server, both or neither."""
 
     def __init__(self) -> None:
-        self.parts: list[MonitorServer | FoxgloveServer | Reports] = []  # Bound: three views.
+        self.closers: list[Callable[[], None]] = []  # Bound: three views.
 
     def close(self) -> None:
         """End all of them."""
-        for part in reversed(self.parts):
-            part.close()
+        for close in reversed(self.closers):
+            close()
 
 
 def start_views(session: Session, log: LogCallback, *, reports: bool = True) -> Views:
@@ -43,7 +45,7 @@ def start_views(session: Session, log: LogCallback, *, reports: bool = True) -> 
     views = Views()
     try:
         if session.rig.monitor.enabled:
-            views.parts.append(_start_page(session, log))
+            views.closers.append(_start_page(session, log).close)
         if session.rig.monitor.foxglove:
             _start_foxglove(session, log, views, reports)
     except BaseException:
@@ -69,11 +71,8 @@ def _start_page(session: Session, log: LogCallback) -> MonitorServer:
 
 def _start_foxglove(session: Session, log: LogCallback, views: Views, reports: bool) -> None:
     need_server()
-    # Imported here, as the page.
-    from psd_deflection.run.monitor.foxglove import FoxgloveServer
-
-    server = FoxgloveServer(session.rig, log)
-    views.parts.append(server)
+    server = foxglove().FoxgloveServer(session.rig, log)
+    views.closers.append(server.close)
     log(server.words())
     fanout = Fanout(session.rig.monitor.frame_prefix)
     fanout.sinks.append(server)
@@ -83,7 +82,15 @@ def _start_foxglove(session: Session, log: LogCallback, views: Views, reports: b
     session.fanout.change_sinks.append(rig_reported)
     session.input_sinks.append(fanout)
     if reports:
-        views.parts.append(Reports(session, fanout))
+        views.closers.append(Reports(session, fanout).close)
+
+
+def foxglove() -> Any:
+    """The module of the optional server, which needs aiohttp. Raises ConfigError if it is not there."""
+    found = optional('psd_deflection.run.monitor.foxglove')
+    if found is None:
+        raise ConfigError('foxglove = true: this installation has no run/monitor/foxglove.py')
+    return found
 
 
 class Reports:

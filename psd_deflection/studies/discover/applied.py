@@ -13,11 +13,11 @@ import numpy.typing as npt
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import note_finding
 from psd_deflection.studies.discover.hidden import Direction, LoadDirection
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.annotated_times import CorrectedNote, MeasuredLoad, shifted
 from psd_deflection.studies.loads.effective import SwayingLoad, swaying

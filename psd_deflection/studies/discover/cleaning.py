@@ -16,10 +16,10 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, channel_names, dot_channels
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.proposals import coarse_step
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads, correct_loads
 

@@ -15,6 +15,7 @@ import numpy as np
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.shared_findings import noise_findings, step_findings
@@ -29,7 +30,6 @@ from psd_deflection.studies.discover.applied import (
 )
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, LoadDirection
 from psd_deflection.studies.discover.laws import FoundLaw, find_law
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import (
     RecordedRig,

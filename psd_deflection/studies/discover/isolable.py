@@ -19,9 +19,9 @@ from psd_deflection.base.tables import Column, Table, columns, text_column
 from psd_deflection.model.simulation.catalogue import effects_for
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import SEPARATES
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import yaml
 
 from psd_deflection.base.tables import Table
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.studies.discover.experiment import Limits
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan, plan_next
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import PageSection, StudyResult

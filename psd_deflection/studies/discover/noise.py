@@ -16,9 +16,9 @@ from scipy.linalg import solve_toeplitz
 from scipy.ndimage import median_filter
 from scipy.signal import detrend
 
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.discover.observation import Observation
 
 CLIP = 6.0
 """Whitened values are limited to this: an outlier is no slow noise."""

@@ -16,6 +16,7 @@ import numpy as np
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.check.result import Finding
@@ -23,7 +24,6 @@ from psd_deflection.studies.check.shared_findings import note_finding
 from psd_deflection.studies.discover.applied import directions, in_time, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.cleaning import clean, time_loads
 from psd_deflection.studies.discover.hidden import Direction, LoadDirection, ZeroDirection, beginning
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step

@@ -11,11 +11,11 @@ import numpy as np
 
 from psd_deflection.model.simulation.catalogue import effects_for, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.recordings.observation import Observation, check_same_psds
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.hidden import FIRST, SETUP, mistakes
-from psd_deflection.studies.discover.observation import Observation, check_same_psds
 from psd_deflection.studies.discover.planning import Suggestion, suggest
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress
 from psd_deflection.studies.discover.recorded import Recorded

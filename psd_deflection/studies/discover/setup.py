@@ -13,6 +13,7 @@ from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -20,7 +21,6 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import LOADS, unit_findings, wiring_findings
 from psd_deflection.studies.check.wirings import differences, line, wirings_of
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, zero_moved
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.plate_motion import dots_of

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.arms.shapers import Shaper, recommended
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, text_column
+from psd_deflection.model.link.shapers import Shaper, recommended
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import with_values

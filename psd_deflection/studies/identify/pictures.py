@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from scipy.signal import welch
 
-from psd_deflection.arms.shapers import KINDS, Shaper, shaper
 from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Rule, Series, TimeAxis
 from psd_deflection.base.pages import table
+from psd_deflection.model.link.shapers import KINDS, Shaper, shaper
 from psd_deflection.recordings.charts import FROM_FIRST
 from psd_deflection.records import FloatArray, Moment
 from psd_deflection.studies.identify.spectra import AxisModes

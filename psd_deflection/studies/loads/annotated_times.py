@@ -12,20 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.measure.steps import LEAST_SHARE, PERIODS, DotStep, lasting_steps
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.steps import (
-    LEAST_SHARE,
-    PERIODS,
-    DotStep,
-    applied,
-    lasting_steps,
-    link_modes,
-    time_of_step,
-)
+from psd_deflection.studies.loads.steps import applied, link_modes, time_of_step
 
 SHARE = 0.02
 """Loads that change at more than this share of the samples were measured, not noted by a person."""

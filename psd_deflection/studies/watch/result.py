@@ -11,7 +11,7 @@ import numpy as np
 from psd_deflection.base.charts import Chart, Panel, Series, TimeAxis
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, text_column
-from psd_deflection.measure.watch import Alarm
+from psd_deflection.measure.watch import Alarm, alarm_sentences
 from psd_deflection.recordings.charts import FROM_FIRST
 from psd_deflection.records import Moment
 from psd_deflection.studies.study import PageSection, StudyResult
@@ -42,8 +42,7 @@ class WatchedRun(StudyResult):
 
     def sentences(self) -> list[str]:
         """Return each alarm with its time; or that there was none, and what was watched."""
-        lines = [f'since {self.since_s(a):.1f} s: {a.words}' for a in self.alarms]
-        return lines or [f'the rig is its model; watched: {self.watched}']
+        return alarm_sentences(self.alarms, self.start_ns, self.watched)
 
     def tree(self) -> dict[str, Any]:
         """Return the alarms: times in s from the first sample, shifts in m (of theta in rad)."""

@@ -10,7 +10,7 @@ from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_positio
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.thesis.scaling import FORCE, TwinLink, table_b1_cases
+from psd_deflection.studies.scaling import FORCE, TwinLink, table_b1_cases
 
 CERTAIN = np.zeros((3, 3))
 RIGID = 1e7

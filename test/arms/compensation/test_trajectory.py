@@ -18,8 +18,8 @@ from bench.trajectory_controller import TrajectoryController
 from psd_deflection.arms.compensation.arm import JointLimits, read_limits
 from psd_deflection.arms.compensation.trajectory import MovingError, Trajectory, TrajectoryShaper, checked, start_of
 from psd_deflection.arms.inputs import MeasuredJoint, standing
-from psd_deflection.arms.shapers import KINDS, TOLERATED, Shaper, in_series, recommended, shaper
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link.shapers import KINDS, TOLERATED, Shaper, in_series, recommended, shaper
 from psd_deflection.records import FloatArray
 
 S = 1_000_000_000

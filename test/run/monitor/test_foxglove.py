@@ -140,7 +140,8 @@ def test_an_address_that_is_not_ours_is_named() -> None:
 def test_without_aiohttp_the_error_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: None)
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: None if name == 'aiohttp' else found(name))
     assert main(['monitor', str(BAGS / 'clean'), '--foxglove']) == 3
     assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err
 

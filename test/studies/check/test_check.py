@@ -18,12 +18,12 @@ from blind import generator
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import read_observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.check.checkup import check, of_recording, responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
-from psd_deflection.studies.discover.from_recordings import read_observation
 
 CLOUD = 2e-3 * 0.5e-3
 """Noise of one sample, m."""

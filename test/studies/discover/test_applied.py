@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.catalogue import effect_names, make_active
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover import recorded_rig
 from psd_deflection.studies.discover.applied import directions, ringing_on, unseen
 from psd_deflection.studies.discover.discover import discover, refitted
 from psd_deflection.studies.discover.hidden import LoadDirection, ZeroDirection, moved
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.redundant import FourthReading, excess, visible

@@ -15,6 +15,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import effect_names, effects_of_rig, make_active
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.records import FloatArray, ParameterChange
@@ -23,7 +24,6 @@ from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.check.result import NAMES, Finding
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import SignatureBank, solve_observable

@@ -15,13 +15,13 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation, load_cases
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover import experiment
 from psd_deflection.studies.discover.cleaning import clean, stuck
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
 from psd_deflection.studies.discover.noise import NoiseModel, rest_windows, strip_lines
-from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import energies, gain_beyond
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace

@@ -22,10 +22,10 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, Ef
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.laws import find_jitter, find_law
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit

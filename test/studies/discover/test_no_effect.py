@@ -16,13 +16,13 @@ from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import zero_variances_at_end
 from psd_deflection.records import DOT_CHANNELS, FloatArray, ParameterChange
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.noise import NoiseModel, SlowNoise, block_factor, corners_of
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.recorded import Recorded, with_free
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit

@@ -12,12 +12,12 @@ from scipy.optimize import brentq
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.studies.discover import cleaning
 from psd_deflection.studies.discover.hidden import FIRST, LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.noise import estimate_noise
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.search import localise, proposals
 from psd_deflection.studies.discover.search.comparison import Comparison

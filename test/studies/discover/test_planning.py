@@ -24,6 +24,7 @@ from psd_deflection.model.simulation.catalogue import effect_names, make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.loads import load_history
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover import loop
@@ -31,7 +32,6 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, Setting, expected_sums, pieces, proposals, settings
 from psd_deflection.studies.discover.from_recordings import read_observations
 from psd_deflection.studies.discover.isolable import Isolability, Isolable, isolable
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import SEPARATES, Plan, plan_next
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import Fit, refit

@@ -18,9 +18,9 @@ from psd_deflection.recordings.read.references import is_table
 from psd_deflection.recordings.write.bag_writer import McapFile
 from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, TemperatureReading
 from psd_deflection.rig.config import load_rig, replace_values
-from psd_deflection.studies.discover.from_recordings import read_tables
 from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.plants import CHANNELS, Readings, ReadingsPlant
+from psd_deflection.studies.discover.readings import read_tables
 
 RIG = load_rig()
 LOADS = np.array(

@@ -21,11 +21,11 @@ from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover import experiment, planning
 from psd_deflection.studies.discover.noise import NoiseModel, estimate_noise
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Machine, Problem
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut, heldout_gain, heldout_gap, heldout_residual, refit

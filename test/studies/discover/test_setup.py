@@ -14,12 +14,11 @@ from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import effect_names
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.observation import Observation, read_observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.cleaning import clean, outliers
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.from_recordings import read_observation
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, likely_delays, likely_jumps

@@ -13,12 +13,12 @@ import pytest
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.model.simulation.catalogue import make_active, with_effects
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import dot_names
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.redundant import fourth, fourth_reading
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring

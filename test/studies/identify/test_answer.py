@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from blind.modes import RATE
-from psd_deflection.arms.shapers import recommended, shaper
 from psd_deflection.cli.main import main
+from psd_deflection.model.link.shapers import recommended, shaper
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
 from psd_deflection.studies.identify.identify import Identified
 from psd_deflection.studies.identify.spectra import AxisModes, Mode

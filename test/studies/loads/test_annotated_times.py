@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.calibrate.from_recordings import with_effective_loads
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads.annotated_times import ALIKE_S, CorrectedLoads, CorrectedNote, correct_loads, shifted
 from test.studies.held_loads import RIG, answers, read
 

@@ -9,6 +9,8 @@ from typing import cast
 import numpy as np
 import pytest
 
+from psd_deflection.measure import steps as found_steps
+from psd_deflection.measure.steps import DotStep, last_load_change
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig, load_rig
@@ -22,7 +24,6 @@ from psd_deflection.studies.loads.annotated_times import (
     unannotated_steps,
 )
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
-from psd_deflection.studies.loads.steps import last_load_change
 
 
 def note(
@@ -127,18 +128,16 @@ def test_a_step_agrees_with_a_sample_by_sample_account(width: int, lost: float, 
         middle = sum(at * w for at, w in over.items()) / sum(over.values())
         wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
     with np.errstate(invalid='raise', divide='raise'):
-        found = [(s.at, s.size, s.first, s.last) for s in steps_module.steps_among_samples(dots, width)]
+        found = [(s.at, s.size, s.first, s.last) for s in found_steps.steps_among_samples(dots, width)]
     assert len(found) == len(wanted)
     assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
 
 
-def as_steps(*places: tuple[float, float]) -> list[steps_module.DotStep]:
-    return [steps_module.DotStep(at, size, round(at) - 5, round(at) + 5) for at, size in places]
+def as_steps(*places: tuple[float, float]) -> list[DotStep]:
+    return [DotStep(at, size, round(at) - 5, round(at) + 5) for at, size in places]
 
 
-def cheapest(
-    changes: IntArray, sizes: FloatArray, steps: list[steps_module.DotStep], period: float
-) -> list[tuple[int, int]]:
+def cheapest(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
     """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
     observed = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
     factor = sum(s.size for s in steps) / sum(sizes[i] for i in observed)
@@ -273,9 +272,7 @@ class Looked:
     ('start', 'took', 'middle'), [(3.0, 0.0, 3.0), (3.0, 0.0, 3.14), (3.0, 0.0, 2.86), (3.0, 0.2, 3.1), (3.0, 2.0, 4.0)]
 )
 def test_step_time_is_fitted_beside_drift_and_ringing(start: float, took: float, middle: float) -> None:
-    step = steps_module.DotStep(
-        1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200
-    )
+    step = DotStep(1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200)
     found = steps_module.time_of_step(RIG, moved_by(start, took), step, (2000.0, 6000.0), 1e-3)
     assert found == pytest.approx((start, took), abs=1e-3 if took else 2e-5)
 
@@ -293,7 +290,7 @@ def test_step_time_is_fitted_beside_drift_and_ringing(start: float, took: float,
 )
 def test_a_step_is_fitted_without_its_neighbours(between: tuple[float, float], window: tuple[int, int]) -> None:
     looked = Looked(moved_by(5.0, 0.0, 9000))
-    step = steps_module.DotStep(5000.0, 1e-4, 4900, 5100)
+    step = DotStep(5000.0, 1e-4, 4900, 5100)
     steps_module.time_of_step(RIG, cast(FloatArray, looked), step, between, 1e-3)
     assert {(part.start, part.stop) for part in looked.parts} == {window}
 
@@ -306,7 +303,7 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
         def __getitem__(self, part: slice) -> FloatArray:
             return self.dots[part.start - 1_000_000 : part.stop - 1_000_000]
 
-    step = steps_module.DotStep(1_003_000.0, 1e-4, 1_002_800, 1_003_200)
+    step = DotStep(1_003_000.0, 1e-4, 1_002_800, 1_003_200)
     found = steps_module.time_of_step(
         RIG, cast(FloatArray, Later(moved_by(3.0, 0.0, rung=100.0))), step, (0.0, 2e6), 1e-3
     )
@@ -344,7 +341,7 @@ def test_rough_motion_under_a_slow_load_is_excluded() -> None:
 
 def with_pieces(
     monkeypatch: pytest.MonkeyPatch,
-    steps: list[steps_module.DotStep],
+    steps: list[DotStep],
     fitted: dict[float, tuple[float, float]],
     residual: tuple[float, float] = (1.0, 100.0),
 ) -> list[tuple[float, float]]:
@@ -354,14 +351,14 @@ def with_pieces(
     between: list[tuple[float, float]] = []
 
     def fit(
-        rig: Rig, dots: FloatArray, step: steps_module.DotStep, edges: tuple[float, float], period: float
+        rig: Rig, dots: FloatArray, step: DotStep, edges: tuple[float, float], period: float
     ) -> tuple[float, float]:
         between.append(edges)
         return fitted[step.at]
 
     leaves = iter([residual[0], residual[1]] * 9)
     monkeypatch.setattr(annotated_times, 'lasting_steps', lambda dots, width: steps)
-    monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
+    monkeypatch.setattr(found_steps, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(annotated_times, 'time_of_step', fit)
     monkeypatch.setattr(
         annotated_times, 'residual_of_dots', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4)))
@@ -383,7 +380,7 @@ def test_last_step_is_the_last_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = [steps_module.DotStep(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0)]
+    steps = [DotStep(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0)]
     with_pieces(monkeypatch, steps, {3000.0: (3.01, 0.0), 8000.0: (8.0, 0.0)})
     dots = np.zeros((20_000, 4))
     for apart, reported in ((249, []), (250, [3.01])):

@@ -16,6 +16,22 @@ from psd_deflection.model.link.section import TubeSection
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers.interface import SolverStatus
 from psd_deflection.model.solvers.registry import SOLVERS, make_solver
+from psd_deflection.studies.scaling import (
+    BASE_SECTION,
+    COLUMNS,
+    ERRATA_B1,
+    ERRATA_B2,
+    FORCE,
+    MATERIALS,
+    YOUNGS_MODULUS,
+    TableCell,
+    round_as,
+    table_b1,
+    table_b1_cases,
+    table_b2,
+    torsion_to_bending_ratio,
+    torsion_to_bending_ratio_exact,
+)
 from psd_deflection.studies.thesis.appendix_d import compared, mismatch, tilt_branches
 from psd_deflection.studies.thesis.comparison import (
     CAUSES,
@@ -32,22 +48,6 @@ from psd_deflection.studies.thesis.comparison import (
     spot_run,
     table_5_1,
     thesis_geometry,
-)
-from psd_deflection.studies.thesis.scaling import (
-    BASE_SECTION,
-    COLUMNS,
-    ERRATA_B1,
-    ERRATA_B2,
-    FORCE,
-    MATERIALS,
-    YOUNGS_MODULUS,
-    TableCell,
-    round_as,
-    table_b1,
-    table_b1_cases,
-    table_b2,
-    torsion_to_bending_ratio,
-    torsion_to_bending_ratio_exact,
 )
 
 Cell = tuple[float, float, float]

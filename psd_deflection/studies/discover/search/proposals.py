@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
-from psd_deflection.studies.discover.observation import Observation
 
 LEAST_THERE = 0.1
 """Share of the samples of a quarter that tell whether a line is there."""

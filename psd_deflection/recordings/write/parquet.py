@@ -28,6 +28,10 @@ class Field(NamedTuple):
     unit: str = ''
 
 
+ERROR = Field('error', str)
+"""Column of a table with one row a recording: why it failed, else empty."""
+
+
 def is_parquet(path: str | None) -> bool:
     """Whether ``path`` has the ending of such a file."""
     return path is not None and Path(path).suffix.lower() == ENDING

@@ -1,0 +1,99 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of the dots that last, by means over whole bending periods on either side of a moment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+
+PERIODS = 4
+"""Bending periods that each mean on either side of a moment takes."""
+STANDS_OUT = 10.0
+"""Factor by which a step must exceed the median of what is there without one."""
+LEAST_SHARE = 0.03
+"""A step is at least this share of the largest."""
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class DotStep:
+    """``at``: sample of its middle; ``size``: how far the dots moved, m; ``first``, ``last``: samples about it.
+    ``lost``: samples about it of which none is there.
+    """
+
+    at: float
+    size: float
+    first: int
+    last: int
+    lost: int = 0
+
+
+def last_load_change(rig: Rig, dots: FloatArray, period: float) -> float | None:
+    """When the last lasting step of ``dots`` (n, 2P), m, was, s from the first of them; None if they have none.
+
+    ``period``: s from one to the next; they may be means of blocks. The time is that of the step's middle, to a
+    fraction of a period of the link's bending.
+    """
+    steps = lasting_steps(dots, max(2, round(PERIODS / rig.dynamics.bending_frequency / period)))
+    return steps[-1].at * period if steps else None
+
+
+def lasting_steps(dots: FloatArray, width: int) -> list[DotStep]:
+    """Where the mean of ``width`` samples differs from that of as many before; of samples that are there, if more than
+    a quarter of as many are lost at once: the step may lie among those.
+    """
+    there: BoolArray = np.all(np.isfinite(dots), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([True], there, [True])).astype(np.int8)))
+    keep = np.ones(len(dots), dtype=bool)
+    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if b - a > width // 4:
+            keep[a:b] = False
+    lasting = np.flatnonzero(keep)
+    out = []
+    for step in steps_among_samples(dots[lasting], width):
+        first, last = lasting[[step.first, step.last]].tolist()
+        # Between the last sample before it and the first after it.
+        before, after = np.interp((step.at - 1.0, step.at), np.arange(len(lasting)), lasting).tolist()
+        lost = last - first - (step.last - step.first)
+        out.append(DotStep(0.5 * (before + 1.0 + after), step.size, first, last, lost))
+    return out
+
+
+def steps_among_samples(dots: FloatArray, width: int) -> list[DotStep]:
+    """Return the lasting steps of dots (n, 4), m, without regard to lost samples."""
+    n = len(dots)
+    if n < 4 * width:
+        return []
+    there: BoolArray = np.all(np.isfinite(dots), axis=1)
+    sums = np.vstack((np.zeros(dots.shape[1]), np.cumsum(np.where(there[:, None], dots, 0.0), axis=0)))
+    counts = np.concatenate(([0], np.cumsum(there)))
+    at = np.arange(width, n - width)
+    before, after = counts[at] - counts[at - width], counts[at + width] - counts[at]
+    apart = (sums[at + width] - sums[at]) / np.maximum(after, 1)[:, None]
+    apart -= (sums[at] - sums[at - width]) / np.maximum(before, 1)[:, None]
+    size = np.where((before > width // 4) & (after > width // 4), np.linalg.norm(apart, axis=1), 0.0)
+    least = max(STANDS_OUT * float(np.median(size)), LEAST_SHARE * float(size.max(initial=0.0)))
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], size > least, [False])).astype(np.int8)))
+    out = []
+    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        # Two steps close together make one stretch with two peaks.
+        weights = np.maximum(size[a:b] - 0.5 * size[a:b].max(), 0.0)
+        if b - a < width // 2:
+            continue
+        first, last = a + width, b + width
+        moved = _difference(dots, slice(last, last + width), slice(a, first))
+        out.append(DotStep(float(at[a:b] @ weights / weights.sum()), float(np.linalg.norm(moved, axis=0)), first, last))
+    return out
+
+
+def _difference(dots: FloatArray, after: slice, before: slice) -> FloatArray:
+    means = []
+    for part in (dots[after], dots[before]):
+        good = part[np.isfinite(part).all(axis=1)]
+        means.append(good.mean(axis=0) if len(good) else np.zeros(dots.shape[1]))
+    return np.asarray(means[0] - means[1])
