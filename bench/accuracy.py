@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 
+from blind.generator import flat_dots
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.loads import constant, direct, sidebar
@@ -21,18 +22,11 @@ CASES |= {f'{f:g} N on the sidebar': sidebar(f) for f in (10.0, 30.0, 50.0)}
 CASES |= {f'{f:g} N on the link': direct(f) for f in (10.0, 30.0, 50.0)}
 
 
-def dots(rig: Rig, pose: FloatArray) -> FloatArray:
-    """x1 y1 x2 y2 (4,), m, of a flat plate."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    rotated = np.array([[c, s], [-s, c]])
-    return np.concatenate([rotated @ (np.array(psd.center) - pose[:2]) - psd.center for psd in rig.psds])
-
-
 def bound(rig: Rig, pose: FloatArray) -> FloatArray:
     """Least standard deviations of dX, dY (m) and theta (rad) of one block's mean."""
     steps = (1e-7, 1e-7, 1e-6)
-    columns = [(dots(rig, pose + h) - dots(rig, pose - h)) / (2 * h.sum()) for h in np.diag(steps)]
-    jacobian = np.stack(columns, axis=1)
+    h = np.diag(steps)
+    jacobian = ((flat_dots(pose + h) - flat_dots(pose - h)) / (2 * h.sum(axis=1, keepdims=True))).T
     variances = dot_noise_variances(rig) / rig.estimator.block_size
     information = (jacobian.T / variances) @ jacobian
     return np.asarray(np.sqrt(np.linalg.inv(information).diagonal()))
@@ -55,7 +49,6 @@ def errors(rig: Rig, load: tuple[float, float, float], blocks: int) -> tuple[Flo
 
 
 def main() -> int:
-    """Print rms errors and their ratios to the bound."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--blocks', type=int, default=5000, help='blocks of each load case')
     blocks = parser.parse_args().blocks

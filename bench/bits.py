@@ -6,11 +6,11 @@ import argparse
 import concurrent.futures
 import hashlib
 import os
+import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,31 +20,15 @@ KERNELS = {'Haswell': 'avx2', 'SkylakeX': 'avx512f', 'Zen': 'avx2', 'Nehalem': '
 """Kernels of OpenBLAS, each with the instructions that it needs, as /proc/cpuinfo names them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """``environment``: what tells a process to compute so."""
-
-    name: str
-    environment: Mapping[str, str]
-
-
-def settings() -> tuple[list[Setting], list[str]]:
-    """Those that this processor can run, and the names of the others."""
-    flags = _flags()
+def settings() -> tuple[dict[str, dict[str, str]], list[str]]:
+    """The environment of each setting that this processor can run, by its name; the kernels that it cannot."""
+    flags = set(' '.join(re.findall('^flags.*', Path('/proc/cpuinfo').read_text(encoding='utf-8'), re.M)).split())
     there = [kernel for kernel, needs in KERNELS.items() if needs in flags]
-    out = [Setting(kernel, {'OPENBLAS_CORETYPE': kernel}) for kernel in there]
-    out += [Setting(name, {'NPY_DISABLE_CPU_FEATURES': ' '.join(off)}) for name, off in _numpy_features() if off]
+    out = {kernel: {'OPENBLAS_CORETYPE': kernel} for kernel in there}
+    out |= {name: {'NPY_DISABLE_CPU_FEATURES': ' '.join(off)} for name, off in _numpy_features() if off}
     if 'fma' in flags:
-        out.append(Setting('libc without FMA', {'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F'}))
+        out['libc without FMA'] = {'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F'}
     return out, [kernel for kernel in KERNELS if kernel not in there]
-
-
-def _flags() -> set[str]:
-    try:
-        text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
-    except OSError:
-        return set()
-    return set(next((line for line in text.splitlines() if line.startswith('flags')), '').split())
 
 
 def _numpy_features() -> list[tuple[str, list[str]]]:
@@ -59,14 +43,14 @@ def _numpy_features() -> list[tuple[str, list[str]]]:
     return [('numpy without AVX-512', widest), ('numpy without AVX2', have)]
 
 
-def of_setting(setting: Setting, *words: str) -> str:
+def of_setting(setting: dict[str, str], *words: str) -> str:
     """What this module prints in a process of that setting."""
     environment = {k: v for k, v in os.environ.items() if k not in ('OPENBLAS_CORETYPE', 'NPY_DISABLE_CPU_FEATURES')}
-    environment |= {**setting.environment, 'OMP_NUM_THREADS': '1'}
+    environment |= {**setting, 'OMP_NUM_THREADS': '1'}
     command = [sys.executable, '-m', 'bench.bits', *words]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f'{setting.name}: {" ".join(words)} ended with {done.returncode}:\n{done.stderr}')
+        raise SystemExit(f'{setting}: {" ".join(words)} ended with {done.returncode}:\n{done.stderr}')
     return done.stdout
 
 
@@ -118,30 +102,28 @@ def estimates_of(folder: Path) -> str:
 
 
 def table(jobs: int, folder: Path) -> bool:
-    """Print the table; whether no bit differs."""
     every, excluded = settings()
-    places = {}
-    for i, setting in enumerate(every):
-        places[setting.name] = folder / str(i)
-        places[setting.name].mkdir()
+    places = {name: folder / str(i) for i, name in enumerate(every)}
+    for place in places.values():
+        place.mkdir()
     with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
-        list(pool.map(lambda s: of_setting(s, '--record', str(places[s.name])), every))
+        list(pool.map(lambda name: of_setting(every[name], '--record', str(places[name])), every))
         # What is the same message by message is replayed once for all.
         first = {estimates_of(place): str(place) for place in reversed(places.values())}
         kinds = {name: estimates_of(place) for name, place in places.items()}
-        answers = pool.map(lambda s: of_setting(s, '--compare', *first.values()), every)
+        answers = pool.map(lambda one: of_setting(one, '--compare', *first.values()), every.values())
         differing = [
             dict(zip(first, (tuple(map(int, line.split())) for line in answer.splitlines()), strict=True))
             for answer in answers
         ]
-    wide = max(len(setting.name) for setting in every)
+    wide = max(map(len, every))
     print('messages that differ; recorded under: one row each, replayed under: one column each, in the same order')
     total = 0
-    for setting in every:
-        counts = [found[kinds[setting.name]][0] for found in differing]
+    for name in every:
+        counts = [found[kinds[name]][0] for found in differing]
         total += sum(counts)
-        print(f'{setting.name:<{wide}}  ' + ' '.join(f'{count:>5}' for count in counts))
-    equal = differing[0][kinds[every[0].name]][1]
+        print(f'{name:<{wide}}  ' + ' '.join(f'{count:>5}' for count in counts))
+    equal = differing[0][kinds[next(iter(every))]][1]
     print(
         f'{len(every)} settings, {equal} messages each ({", ".join(NAMES)}): '
         + ('no bit differs' if not total else f'{total} differ')
@@ -152,7 +134,6 @@ def table(jobs: int, folder: Path) -> bool:
 
 
 def main() -> int:
-    """Print the table, or do one setting's part of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes at a time')
     parser.add_argument('--record', type=Path, metavar='FOLDER', help=argparse.SUPPRESS)

@@ -1,7 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make demo NAME=compensate``: a simulated arm of two links with and without compensation and shapers, on one
-page."""
+"""``make demo NAME=compensate``: a simulated arm with and without compensation and shapers, on one page."""
 
 import argparse
 import collections
@@ -60,7 +59,6 @@ def wanted(t: float) -> FloatArray:
 
 
 def run(compensated: bool, end: float = END) -> Ran:
-    """One run, with or without compensation."""
     file = read_chain(ROOT / 'config' / 'two_links.yaml')
     plant = SimulatedArm(file.chain, POSES[0], damping=0.02)
     arm = read_arm(URDF, 'tool')
@@ -92,7 +90,6 @@ def run(compensated: bool, end: float = END) -> Ran:
 
 
 def rms(ran: Ran, window: tuple[float, float]) -> float:
-    """Root mean square of the error within a window of times, m."""
     inside = (ran.t >= window[0]) & (ran.t < window[1])
     return float(np.sqrt(np.mean(ran.error[inside] ** 2)))
 
@@ -118,7 +115,6 @@ def chart(without: Ran, ran: Ran) -> Chart:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run both, print the table, write the page and the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--out', type=Path, default=ROOT / 'build' / 'compensate')
     args = parser.parse_args(argv)
@@ -131,7 +127,7 @@ def main(argv: list[str] | None = None) -> int:
     compensated = chart(without, ran)
     print(f'vibration after a quick move without a shaper: {1e3 * shapers.unshaped():.2f} mm')
     left = shapers.rows()
-    shapers.printed(shapers.SHAPER_HEAD, left)
+    print(*('  '.join(f'{cell:>12}' for cell in row) for row in (shapers.SHAPER_HEAD, *left)), sep='\n')
     head = ('rms distance from the rigid pose', 'without, mm', 'with, mm', 'left')
     body = [
         '<h1>A payload on a flexible arm, with and without compensation</h1>',

@@ -8,18 +8,18 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
 import time
+import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from bench.live import BLOCKS_PER_S, Device
-from bench.rows import ROOT, Row, figure, keep
+from bench.rows import ROOT, Row, figure, keep, piped
 from blind.campaign import conclude, options
 
 RESULTS = ROOT / 'bench' / 'cpu.json'
@@ -27,50 +27,12 @@ SETTLE_BLOCKS = 250  # Five seconds of blocks: what is imported and made at the 
 PATIENCE_S = 300.0  # Longest time until the node runs, s.
 ENOUGH = 0.98  # Least share of the blocks that a node gets through which is not held up by others.
 
-PARTS = {
-    'port: select and read': ('devices.port:DescriptorPort.read',),
-    'frames: bytes to samples': ('devices.protocol.frames:FrameDecoder.feed',),
-    'sequence numbers, gathering': ('run.acquisition:Acquisition.feed',),
-    'clock map': ('run.clock_watch:ClockWatch.observe',),
-    'chunk: stamps, arrays, queue': ('run.acquisition:Acquisition._enqueue',),
-    'sleep until samples gather': ('run.acquisition:Acquisition._gather',),
-    'pings': ('run.hello:Pinger.ask',),
-    'blocks by number': ('measure.averaging:BlockCutter.add',),
-    'volts to metres, corrections': ('measure.pipeline:counts_to_volts', 'measure.pipeline:Pipeline.dots'),
-    'lasers and detectors': (
-        'measure.health:OpticsHealth.classify',
-        'measure.health:OpticsHealth.still',
-        'measure.health:OpticsHealth.late_findings',
-    ),
-    'fit of the block': ('measure.uncertainty.block_fit:BlockFit._together',),
-    'check of the readings': ('measure.uncertainty.block_estimator:BlockEstimator.check',),
-    'primary and other solvers': ('measure.estimation:Estimation._solution',),
-    'uncertainty of the calibration': ('model.misalignment.rig:ParameterCovariance.factor',),
-    'covariance of the estimates': ('measure.estimation:Estimation._estimates',),
-    'tip load': ('model.simulation.tip_load:TipLoads.tip_load',),
-    'means and scatter of the readings': ('measure.pipeline:measured',),
-    'noise learnt': ('measure.uncertainty.block_estimator:BlockEstimator.learn',),
-    'search for a wrong reading': ('measure.uncertainty.block_estimator:BlockEstimator.search_outliers',),
-    'watch: is the rig its model?': ('run.watcher:Watcher.put',),
-    'messages: fields of the records': ('run.fanout:Fanout.put',),
-    'messages: CDR': ('recordings.cdr:encode',),
-    'publishing: rclpy and DDS': ('ros.sinks:PublisherSink.put',),
-    'frames on /tf': ('ros.sinks:TransformPublisher.put',),
-    'queue of the recorder': ('run.recorder:Recorder.put',),
-    'other work on a block: records, findings, counters': ('run.processing:Processing.give',),
-    'MCAP: messages': ('recordings.write.bag_writer:BagWriter.write_encoded',),
-    'MCAP: chunks (zstd, CRC, write, fsync)': ('recordings.write.bag_writer:McapFile._flush',),
-    'MCAP: look for room and file': ('run.recorder:Recorder._make_room',),
-    'executor: wait and callbacks': ('ros.running:SingleThreadedExecutor.spin_once',),
-    'diagnostics, rig and zero shown': ('ros.estimator:EstimatorNode.report',),
-}
-"""By its name: functions of the package, ``module:name``. The self time of each is its part's."""
+PARTS: dict[str, list[str]] = tomllib.loads((ROOT / 'bench' / 'cpu_parts.toml').read_text(encoding='utf-8'))
 COLLECTION = 'garbage collection'
 REST = 'rest: waking up, waiting, loops'
 
 
 def resolve(place: str) -> tuple[Any, str, Callable[..., Any]]:
-    """The owner, the name and the function of ``module:name`` in the package."""
     module, _, path = place.partition(':')
     *owners, name = path.split('.')
     owner: Any = importlib.import_module(f'psd_deflection.{module}')
@@ -89,7 +51,6 @@ class Clocks:
         self._inside = threading.local()
 
     def enter(self) -> None:
-        """A part begins in this thread."""
         stack = self._inside.__dict__.setdefault('stack', [])
         # Its clock, and the time in parts inside it.
         stack.append([self.clock(), 0])
@@ -105,7 +66,6 @@ class Clocks:
         self.calls[thread][part] += 1
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """``function``, counted as ``part``."""
 
         def measured(*args: Any, **options: Any) -> Any:
             self.enter()
@@ -117,7 +77,6 @@ class Clocks:
         return measured
 
     def collects(self, phase: str, _: object) -> None:
-        """For ``gc.callbacks``."""
         if phase == 'start':
             self.enter()
         else:
@@ -196,14 +155,11 @@ def parts(reported: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float
 
 
 def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]:
-    """Run the node on a device of its own; what :func:`parts` says of it."""
     device = Device()
     device.thread.start()
     with tempfile.TemporaryDirectory() as folder:
         words = ['--node', device.port.name, '--folder', folder, '--seconds', f'{seconds:g}']
-        child = subprocess.Popen(
-            [sys.executable, '-m', 'bench.cpu', *words], stdout=subprocess.PIPE, text=True, cwd=ROOT
-        )
+        child = piped('bench.cpu', *words)
         timer = threading.Timer(PATIENCE_S + seconds, child.kill)
         timer.start()
         assert child.stdout is not None
@@ -228,7 +184,6 @@ def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]
 
 
 def row_of(spent: dict[tuple[str, str], float], took: float, clocks: float) -> Row:
-    """The table: shares of the node's CPU, %, the largest first."""
     total = sum(spent.values())
     threads: defaultdict[str, float] = defaultdict(float)
     for (thread, _), s in spent.items():
@@ -243,7 +198,6 @@ def row_of(spent: dict[tuple[str, str], float], took: float, clocks: float) -> R
 
 
 def main() -> int:
-    """Measure, print and keep."""
     parser = options(__doc__)
     parser.add_argument('--seconds', type=float, default=20.0, help='of each window (default: 20)')
     parser.add_argument('--results', type=Path, default=RESULTS)

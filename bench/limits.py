@@ -24,8 +24,6 @@ from cobs import cobs
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 from scipy.signal import lsim
 
 from bench.live import make_recording
@@ -57,7 +55,6 @@ TEN = (
 
 
 def frames(times: int) -> list[Row]:
-    """A stream of samples, in pieces as the port gives them, and at once."""
     random = np.random.default_rng(0)
     counts = random.integers(-30000, 30000, (20000, 6)).tolist()
     stream = b''.join(encode(SampleFrame(0, i, 1000 * i, tuple(row))) for i, row in enumerate(counts))
@@ -104,7 +101,6 @@ def frames(times: int) -> list[Row]:
 
 
 def replay(times: int, minutes: float) -> list[Row]:
-    """A recording through the pipeline with all solvers."""
     with tempfile.TemporaryDirectory() as folder:
         path, n = make_recording(Path(folder), minutes)
         (file,) = path.glob('*.mcap')
@@ -117,14 +113,6 @@ def replay(times: int, minutes: float) -> list[Row]:
                 pass
             if pipeline.counters.samples != n:
                 raise SystemExit(f'replay saw {pipeline.counters.samples} of {n} samples')
-
-        def by_rosbags() -> None:
-            pipeline = Pipeline(rig)
-            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-                wanted = [c for c in reader.connections if c.topic == SAMPLES]
-                for connection, _, raw in reader.messages(wanted):
-                    message = reader.deserialize(raw, connection.msgtype)
-                    _process(pipeline, message)
 
         def by_mcap_ros2() -> None:
             pipeline = Pipeline(rig)
@@ -145,7 +133,6 @@ def replay(times: int, minutes: float) -> list[Row]:
                 1.0,
                 times,
                 ('psd_deflection replay', 'ours', ours, None),
-                ('the pipeline fed by rosbags', 'peer', by_rosbags, 1.0),
                 ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0),
                 ('bare mcap iteration of the file', 'limit', limit, 1.3),
             )
@@ -153,7 +140,7 @@ def replay(times: int, minutes: float) -> list[Row]:
 
 
 def _process(pipeline: Pipeline, message: Any) -> None:
-    """The samples of a PointCloud2 of either library."""
+    """The samples of a PointCloud2."""
     points = _points(message)
     volts = np.stack([points[c] for c in CHANNELS], axis=1)
     stamp = message.header.stamp
@@ -178,7 +165,6 @@ def _points(message: Any) -> npt.NDArray[np.void]:
 
 
 def conversion(times: int, minutes: float) -> list[Row]:
-    """CSV to bag and back, with the samples alone."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         table = folder / 'run.csv'
@@ -335,7 +321,6 @@ def search(times: int, seconds: float) -> list[Row]:
 def searched(
     times: int, seconds: float, what: str, effects: Sequence[str], without: Sequence[str], bound: float | None
 ) -> Row:
-    """One of :data:`SEARCHES`."""
     known = load_rig()
     rig: Rig = with_effects_of(known, effects, 'bench')
     history = load_history('identification', 1000.0)

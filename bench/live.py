@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.rows import RESULTS, ROOT, Row, figure, keep, notify
+from bench.rows import RESULTS, ROOT, Row, figure, keep, notify, piped
 
 BLOCKS_PER_S = 50
 START_S = 4.0  # A process has imported rclpy and found the others.
@@ -233,13 +233,7 @@ class Device:
 
 
 def child(role: str, what: str = '', seconds: float = 0.0) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, '-m', 'bench.live', '--role', role, '--of', what, '--seconds', str(seconds)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
+    return piped('bench.live', '--role', role, '--of', what, '--seconds', str(seconds))
 
 
 def cpu_seconds(pid: int) -> float:
@@ -381,7 +375,6 @@ def start(times: int) -> Row:
 
 
 def live_rows(alone: Latencies, with_page: Latencies, bare_parts: list[float]) -> list[Row]:
-    """What :func:`live` measured."""
     rows = []
     for what, found, bounds, most in (
         ('', alone, (1.4, 1.2), 1.25),

@@ -1,16 +1,13 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Compensator and shaper with the real controllers of ros2_control, on hardware that is
-mock_components/GenericSystem."""
+"""Compensator and shaper with the real controllers of ros2_control, on hardware that is mocked."""
 
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import rclpy
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -22,26 +19,24 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from bench.campaign.plant import PERIOD_S, URDF, Spun, message_of
 from bench.simulated_arm import SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.records import FloatArray
 from tools.program import ROOT, Program
 
 HERE = ROOT / 'bench' / 'ros2_control'
-URDF = ROOT / 'config' / 'two_links.urdf'
 NAMES = ('shoulder', 'elbow')
-PERIOD_S = 0.02
-NOISE = 1e-6
 LONGEST_S = 60.0
 FASTEST = 4.0  # Bound of the shaped motion, rad/s: it goes at most 0.4 rad in 0.4 s, from a motion of as much.
 STATES_S = 0.002  # Time between two messages of the joints.
 
 
-class Arm:
+class Arm(Spun):
     """The arm on the graph: the mock's joints, with a deflection under a load. ``positions``: all joints that came."""
 
     def __init__(self) -> None:
-        self.node = rclpy.create_node('mock_hardware')
+        super().__init__('mock_hardware')
         self.bent = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, np.array([1.2, 0.6]))
         self.bent.force = np.array([0.0, 0.0, -20.0])
         self.positions: list[FloatArray] = []
@@ -66,14 +61,9 @@ class Arm:
             return
         self.bent.angles = self.positions[-1].copy()
         self.bent.settle()
-        deflection = self.bent.end().deflection
-        message = PoseWithCovarianceStamped()
+        message = message_of(self.bent.end().deflection, self._noise)
         message.header.frame_id = 'end_effector_rest'
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
-        place, rotated = message.pose.pose.position, message.pose.pose.orientation
-        place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
-        rotated.x, rotated.y, rotated.z, rotated.w = deflection.quaternion.tolist()
-        message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
         self._deflections.publish(message)
 
     def error(self, rigid: FloatArray) -> float:
@@ -85,23 +75,12 @@ class Arm:
         """The largest step of the joints from one message to the next, rad."""
         return float(np.abs(np.diff(self.positions[since:], axis=0)).max())
 
-    def spin(self, seconds: float, condition: Callable[[], bool] = lambda: False, what: str = '') -> None:
-        """Spin until ``condition``, or for ``seconds``; then it is an error if there is a ``what``."""
-        until = time.monotonic() + seconds
-        while not condition():
-            if time.monotonic() > until:
-                if what:
-                    raise SystemExit(f'waited {seconds:g} s for {what}')
-                return
-            rclpy.spin_once(self.node, timeout_sec=0.01)
-
 
 def run(*words: str) -> None:
     subprocess.run(words, check=True, timeout=LONGEST_S)
 
 
 def started(*words: str, until: str) -> Program:
-    """A program that has said ``until``."""
     out = Program(list(words))
     out.until(until)
     return out
@@ -175,15 +154,8 @@ def evaluated(arm: Arm, since: int, what: str) -> None:
 
 def compensated(arm: Arm, programs: list[Program]) -> None:
     """The arm keeps its pose under its load. SystemExit if it does not, or if a command makes a step."""
-    run(
-        'ros2',
-        'control',
-        'switch_controllers',
-        '--deactivate',
-        'joint_trajectory_controller',
-        '--activate',
-        'forward_position_controller',
-    )
+    switch = ('--deactivate', 'joint_trajectory_controller', '--activate', 'forward_position_controller')
+    run('ros2', 'control', 'switch_controllers', *switch)
     words = ['urdf:=' + str(URDF), 'tip:=tool', 'axes:=[x, z]', 'drive:=true', 'output:=commands']
     remap = 'commands:=/forward_position_controller/commands'
     launch = ['ros2', 'launch', 'psd_deflection', 'compensator.launch.py']
@@ -206,9 +178,7 @@ def compensated(arm: Arm, programs: list[Program]) -> None:
         raise SystemExit('compensator: a step')
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Start it all, judge, end it."""
-    rclpy.init(args=argv)
+def main() -> int:
     arm, programs = Arm(), list[Program]()
     try:
         control = ['ros2', 'run', 'controller_manager', 'ros2_control_node', '--ros-args', '--params-file']
@@ -224,8 +194,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for one in reversed(programs):
             one.end()
             print(*one.lines[-20:], sep='\n')
-        arm.node.destroy_node()
-        rclpy.try_shutdown()
+        arm.close()
     return 0
 
 

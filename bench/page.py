@@ -51,7 +51,6 @@ def measured(machine: Mapping[str, Any]) -> str:
 
 
 def shares(row: Row, machine: Mapping[str, Any]) -> str:
-    """What :mod:`bench.cpu` measured: a row for each thread."""
     lines = [
         f'{machine["date"]}, commit {machine["commit"]}, {machine["processor"]}, load {machine["load"]} at the end.',
         *('', f'| {row.work} | {row.unit} |', '|---|---|'),
@@ -67,7 +66,6 @@ def shares(row: Row, machine: Mapping[str, Any]) -> str:
 
 
 def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cpu_machine: Mapping[str, Any]) -> str:
-    """The text of the page: of ``rows``, and of those of :mod:`bench.cpu`."""
     table = ['| work | psd_deflection | beside | ratio (wanted) |', '|---|---|---|---|']
     for row in rows:
         table += lines_of(row)

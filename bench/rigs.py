@@ -5,14 +5,13 @@
 import argparse
 import json
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
-from bench.rows import RESULTS, Row, figure, keep, notify
+from bench.rows import RESULTS, Row, figure, keep, notify, piped
 from psd_deflection.base.log import null_log
 
 SETTLE_S = 3.0
@@ -87,22 +86,12 @@ def sessions(ports: list[str], seconds: float) -> None:
         session.close()
 
 
-def child(role: str, *arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, '-m', 'bench.rigs', '--role', role, *arguments],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=Path(__file__).resolve().parent.parent,
-    )
-
-
 def measure(count: int, seconds: float) -> dict[str, float]:
-    """What ``count`` rigs in one process lose and cost."""
-    feeder = child('devices', '--rigs', str(count))
+    feeder = piped('bench.rigs', '--role', 'devices', '--rigs', str(count))
     assert feeder.stdout is not None
     ports = feeder.stdout.readline().strip()
-    found, _ = child('sessions', '--ports', ports, '--seconds', str(seconds)).communicate()
+    words = ('--role', 'sessions', '--ports', ports, '--seconds', str(seconds))
+    found, _ = piped('bench.rigs', *words).communicate()
     feeder.communicate()
     reported: dict[str, float] = json.loads(found.splitlines()[-1])
     return reported

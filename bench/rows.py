@@ -6,7 +6,9 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,7 +21,7 @@ import numpy.typing as npt
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / 'bench' / 'results.json'
-PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas', 'rosbags')
+PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas')
 
 
 STEADY = 0.25  # Quartiles that are further apart than this share of their median: load from outside shows in them.
@@ -54,7 +56,6 @@ class Row:
     figures: list[Figure] = field(default_factory=list)
 
     def ratio(self, figure: Figure) -> float:
-        """How ours stands to a peer or a limit."""
         ours = self.figures[0].median
         return figure.median / ours if figure.kind == 'peer' else ours / figure.median
 
@@ -99,6 +100,12 @@ def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
     )
 
 
+def piped(module: str, *words: str) -> subprocess.Popen[str]:
+    """A child of ours, whose standard input and output are pipes."""
+    command = [sys.executable, '-m', module, *words]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+
+
 def notify(row: Row) -> None:
     print(row.work)
     for f in row.figures:
@@ -112,7 +119,6 @@ def notify(row: Row) -> None:
 
 
 def keep(rows: Sequence[Row], path: Path = RESULTS) -> None:
-    """Put ``rows`` into the file, in the place of older ones of the same work."""
     kept = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
     kept.update((row.work, row) for row in rows)
     tree = {'machine': machine(), 'rows': [asdict(row) for row in kept.values()]}
@@ -128,31 +134,14 @@ def read(path: Path = RESULTS) -> tuple[list[Row], Mapping[str, Any]]:
 
 def machine() -> dict[str, object]:
     """Where and of what the figures are; the load of the machine by others, of which the spread comes."""
-    processor = next(
-        (line.partition(':')[2].strip() for line in _lines('/proc/cpuinfo') if line.startswith('model name')),
-        platform.machine(),
-    )
+    processor = re.search(r'model name\s*: (.+)', Path('/proc/cpuinfo').read_text(encoding='utf-8'))
     done = subprocess.run(['git', 'rev-parse', '--short=10', 'HEAD'], cwd=ROOT, capture_output=True, text=True)
     return {
         'date': datetime.now(UTC).date().isoformat(),
         'commit': done.stdout.strip(),
-        'processor': processor,
+        'processor': processor[1] if processor else platform.machine(),
         'cores': os.cpu_count(),
         'load': round(os.getloadavg()[0], 1),
         'python': platform.python_version(),
-        'versions': {name: _version(name) for name in PACKAGES},
+        'versions': {name: importlib.metadata.version(name) for name in PACKAGES},
     }
-
-
-def _lines(path: str) -> list[str]:
-    try:
-        return Path(path).read_text(encoding='utf-8').splitlines()
-    except OSError:
-        return []
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return 'not installed'

@@ -1,9 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What shapers leave of a vibration: ``python -m bench.shapers``."""
+"""What shapers leave of a vibration."""
 
 import functools
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -73,18 +72,3 @@ def rows() -> list[tuple[str, ...]]:
         longer = shaper(kind, FREQUENCY, RATIO).duration
         out.append((kind.upper(), f'{1e3 * longer:.0f} ms', *(f'{100.0 * share:.1f} %' for share in shares)))
     return out
-
-
-def printed(head: Sequence[str], body: Sequence[Sequence[str]]) -> None:
-    print('\n| ' + ' | '.join(head) + ' |\n' + '|---' * len(head) + '|')
-    for row in body:
-        print('| ' + ' | '.join(row) + ' |')
-
-
-def main() -> None:
-    print(f'without a shaper: {1e3 * unshaped():.2f} mm')
-    printed(SHAPER_HEAD, rows())
-
-
-if __name__ == '__main__':
-    main()

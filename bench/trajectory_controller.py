@@ -48,7 +48,6 @@ class TrajectoryController:
 
     @property
     def ends(self) -> float:
-        """When it is at its last point, s."""
         return self._begins + self._path.duration
 
     def hold(self, now: float) -> None:
@@ -116,7 +115,6 @@ class ServedController:
         self._server.finish(handle, finish)
 
     def step(self, now: float) -> None:
-        """What it does in a cycle."""
         if self._handle is None or self.mute:
             return
         if now - self._reported >= FEEDBACK_S:

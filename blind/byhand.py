@@ -64,7 +64,6 @@ def _held(levels: Array, times: Array, n: int) -> Array:
 
 
 def _moved(kind: str, times: Array, ends: float, rng: np.random.Generator) -> Array:
-    """Return the times of the notes."""
     annotated = times.copy()
     edges = np.concatenate(([0.5], times, [ends]))
     which = [int(rng.integers(0, len(times)))] if kind == 'one' else range(len(times))

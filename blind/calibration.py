@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from blind import generator, misaligned
-from blind.campaign import options, over
+from blind.campaign import chunk, options, over
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.catalogue import effects_to_values
-from psd_deflection.records import DeflectionEstimate, RawChunk
+from psd_deflection.records import DeflectionEstimate
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.parameter_files import flattened
 from psd_deflection.studies.budget.certificate import CertificateProblem, certify
@@ -75,7 +75,6 @@ def darkened(rig: Rig, light: tuple[misaligned.Light, misaligned.Light], rng: np
 
 
 def calibrated_rig(rig: Rig, run: CalibrationRun) -> tuple[Rig, Calibration]:
-    """Return the rig file's content after the calibration, and what was found."""
     found = calibrate([run], rig)
     values, effects = values_of(found, 'today')
     more = flattened({'effects': effects_to_values(effects)}, 'effects') if effects else {}
@@ -87,15 +86,8 @@ def measured(rig: Rig, volts: Array, zero_after: int = 25) -> tuple[Array, Array
     pipeline = Pipeline(rig)
     found: list[DeflectionEstimate] = []
     cut = zero_after * SIZE
-    seq = np.arange(len(volts))
-    for first, last in ((0, cut), (cut, len(volts))):
-        chunk = RawChunk(
-            seq[first:last],
-            seq[first:last] * 1_000_000,
-            volts[first:last].astype(np.float32),
-            np.zeros(last - first, np.uint8),
-        )
-        records = [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.primary]
+    for first, part in ((0, volts[:cut]), (cut, volts[cut:])):
+        records = [r for r in pipeline.process(chunk(part, first)) if isinstance(r, DeflectionEstimate) and r.primary]
         if first:
             found += records
         elif pipeline.zero() is None:
@@ -111,7 +103,7 @@ def shares_left_open(truth: Mapping[str, float], pose: Array, frames: npt.NDArra
     """Of each parameter the standard deviation after over before, by this generator's own derivatives."""
     at = pose[frames][::4]
     names = list(truth)
-    spread = np.array([_tolerance(n) for n in names])
+    spread = np.array([misaligned.tolerance(n) for n in names])
     slopes = np.empty((len(at), 4, len(names)))
     for i, name in enumerate(names):
         up, down = dict(truth), dict(truth)
@@ -132,21 +124,12 @@ def shares_left_open(truth: Mapping[str, float], pose: Array, frames: npt.NDArra
     return dict(zip(names, np.sqrt(np.diag(left)).tolist(), strict=True))
 
 
-def _tolerance(name: str) -> float:
-    kind = name.partition('.')[2]
-    if name == 'link.slope_ratio':
-        return misaligned.SLOPE[1]
-    if name.startswith('beam'):
-        return misaligned.BEAM_ANGLE if kind.startswith('angle') else misaligned.BEAM_PLACE
-    return misaligned.SPREADS[kind]
-
-
 def shifted(truth: Mapping[str, float], group: str, rng: np.random.Generator) -> dict[str, float]:
     """Return the rig after one group moved by three tolerances, each parameter of it to a side by chance."""
     out = dict(truth)
     for name in out:
         if name.startswith(group):
-            out[name] += 3.0 * _tolerance(name) * float(rng.choice((-1.0, 1.0)))
+            out[name] += 3.0 * misaligned.tolerance(name) * float(rng.choice((-1.0, 1.0)))
     return out
 
 
@@ -166,9 +149,7 @@ def score(seed: int, lit: bool = False) -> Score:
     z = {n: float((found.values[i] - truth[n]) / sd[i]) for i, n in enumerate(NAMES) if n in truth}
     later = misaligned.poses(misaligned.pushes(rng, AFTER, AFTER_SECONDS))
     volts = misaligned.record(truth, later, rng, light=light).volts
-    # Between two samples, by the cubic through four.
-    a, b, c, d = (later[SIZE // 2 + i :: SIZE] for i in (-2, -1, 0, 1))
-    middle = (9.0 * (b + c) - a - d) / 16.0
+    middle = generator.between(later)
     block, estimate, covariance = measured(rig, volts)
     error = estimate - middle[block]
     distance = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error)
@@ -227,11 +208,7 @@ CERTIFIED = {
     'pointing_drift': POINTING,
     'drift_coefficient': DRIFT,
     'temperature_change': WARMER,
-    'profile_change': 0.0,
-    'air_gradient': 0.0,
-    'air_step': 0.0,
-    'interference': 0.0,
-    'bracket_temperature': 0.0,
+    **dict.fromkeys(('profile_change', 'air_gradient', 'air_step', 'interference', 'bracket_temperature'), 0.0),
     'zero_blocks': 25.0,
 }
 """Inputs of the certificate as this generator has them."""
@@ -273,7 +250,6 @@ def certified(seed: int) -> Certified:
 
 
 def table_of_certificates(rigs: Sequence[Certified]) -> Iterator[str]:
-    """Shares that U covers, of ΔX, ΔY, θ."""
     covered = np.stack([one.covered for one in rigs])
     ratio = np.sqrt(np.mean(np.stack([one.ratio for one in rigs]) ** 2, axis=(0, 1)))
     yield '| | ΔX | ΔY | θ | all |\n|---|---|---|---|---|'
@@ -284,72 +260,46 @@ def table_of_certificates(rigs: Sequence[Certified]) -> Iterator[str]:
 
 
 def table_of_errors(scale: float, errors: Sequence[Mapping[str, float]]) -> Iterator[str]:
-    """One row for gains, one for all parameters."""
     for words, part in (('gains', '.gain_'), ('all parameters', '')):
         z = np.array([v for e in errors for name, v in e.items() if part in name])
         yield f'| {scale:g} | {words} | {np.mean(np.abs(z) <= Z95):.1%} of {z.size} | {np.sqrt(np.mean(z**2)):.2f} |'
 
 
 def later_motion(rng: np.random.Generator) -> Array:
-    """Return the motion of the recording that --check gets."""
     return misaligned.poses(misaligned.pushes(rng, 12, SECONDS))
 
 
-class Summary(NamedTuple):
-    """Of all rigs: shares, and what the table prints."""
-
-    parameters: float
-    poses: float
-    worse: int
-    unreported: int
-    message: int
-    named: float
-    alarms: float
-
-
-def summary(scores: Sequence[Score]) -> Summary:
-    z = np.array([list(s.z.values()) for s in scores])
+def table(scores: Sequence[Score]) -> Iterator[str]:
+    every_z = np.array([list(s.z.values()) for s in scores])
     moved = [s for s in scores if s.moved]
     still = [s for s in scores if not s.moved]
     length = np.array([1.0, 1.0, 0.1])
-    return Summary(
-        float(np.mean(np.abs(z) <= Z95)),
-        float(np.mean([s.inside for s in scores])),
-        sum(
-            bool(s.gap[1] > s.gap[0] or np.linalg.norm(s.after * length) > np.linalg.norm(s.before * length))
-            for s in scores
-        ),
-        sum(len(s.unreported) for s in scores),
-        sum(len(s.message) for s in scores),
-        float(np.mean([s.named == s.moved for s in moved])) if moved else 1.0,
-        float(np.mean([bool(s.named) for s in still])) if still else 0.0,
-    )
-
-
-def table(scores: Sequence[Score]) -> Iterator[str]:
-    total = summary(scores)
     yield '| parameter | inside 95 % | rms of error over sd |\n|---|---|---|'
     for name in scores[0].z:
         z = np.array([s.z[name] for s in scores])
         yield f'| {name} | {np.mean(np.abs(z) <= Z95):.1%} | {np.sqrt(np.mean(z**2)):.2f} |'
-    yield f'| all | {total.parameters:.1%} | |'
+    yield f'| all | {np.mean(np.abs(every_z) <= Z95):.1%} | |'
     before, after = (np.sqrt(np.mean([getattr(s, n) ** 2 for s in scores], axis=0)) for n in ('before', 'after'))
     yield ''
     yield '| published pose | ΔX | ΔY | θ | joint |\n|---|---|---|---|---|'
     inside = np.mean([s.axes for s in scores], axis=0)
-    yield f'| inside 95 %, total | {inside[0]:.1%} | {inside[1]:.1%} | {inside[2]:.1%} | {total.poses:.1%} |'
-    yield f'| inside 95 %, noise alone | | | | {np.mean([s.noise_only for s in scores]):.1%} |'
+    joint, alone = (np.mean([getattr(s, n) for s in scores]) for n in ('inside', 'noise_only'))
+    yield f'| inside 95 %, total | {inside[0]:.1%} | {inside[1]:.1%} | {inside[2]:.1%} | {joint:.1%} |'
+    yield f'| inside 95 %, noise alone | | | | {alone:.1%} |'
     for words, e in (('before', before), ('after', after)):
         yield f'| rms error {words} | {e[0] * 1e6:.2f} µm | {e[1] * 1e6:.2f} µm | {np.degrees(e[2]) * 1e3:.2f} mdeg | |'
     yield ''
-    yield f'- rigs that came out worse: {total.worse} of {len(scores)}'
-    every = len(scores) * len(scores[0].z)
-    yield f'- parameters that the Fisher information leaves open and nothing reports: {total.unreported} of {every}'
-    yield f'- parameters reported as open that it does not leave open: {total.message}'
-    moved = [s for s in scores if s.moved]
+    worse = [
+        s.gap[1] > s.gap[0] or np.linalg.norm(s.after * length) > np.linalg.norm(s.before * length) for s in scores
+    ]
+    yield f'- rigs that came out worse: {sum(map(bool, worse))} of {len(scores)}'
+    unreported = sum(len(s.unreported) for s in scores)
+    yield f'- parameters that the Fisher information leaves open and nothing reports: {unreported} of {every_z.size}'
+    yield f'- parameters reported as open that it does not leave open: {sum(len(s.message) for s in scores)}'
+    named = sum(s.named == s.moved for s in moved) / max(len(moved), 1)
     like = sum(s.moved in (s.named, *s.like) for s in moved) / max(len(moved), 1)
-    yield f'- --check: the moved group is named in {total.named:.1%} of {len(moved)}, or among the like: {like:.1%}'
-    yield f'- --check: false alarms in {total.alarms:.1%} of {len(scores) - len(moved)}'
+    yield f'- --check: the moved group is named in {named:.1%} of {len(moved)}, or among the like: {like:.1%}'
+    yield f'- --check: false alarms in {sum(bool(s.named) for s in still) / max(len(still), 1):.1%} of {len(still)}'
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,7 +9,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+import numpy.typing as npt
 from tqdm import tqdm
+
+from psd_deflection.records import RawChunk
 
 C = TypeVar('C')
 R = TypeVar('R')
@@ -24,7 +28,6 @@ def options(about: str | None, jobs: int | None = None) -> argparse.ArgumentPars
 
 
 def watched(cases: Iterable[C], words: str | None = None) -> Iterable[C]:
-    """``cases`` with a progress bar."""
     return tqdm(cases, desc=words, file=sys.stderr)
 
 
@@ -43,8 +46,13 @@ def over(work: Callable[[C], R], cases: Sequence[C], jobs: int = 1, words: str |
                 yield result
 
 
+def chunk(volts: npt.NDArray[np.float64], first: int = 0) -> RawChunk:
+    """The samples ``volts`` (n, 6) at 1 kHz, numbered from ``first``."""
+    seq = np.arange(first, first + len(volts))
+    return RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), np.uint8))
+
+
 def bound_line(met: bool, words: str) -> str:
-    """Return a line that says whether one thing that is wanted is met."""
     return f'{"ok  " if met else "MISS"} {words}'
 
 

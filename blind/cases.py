@@ -4,9 +4,11 @@
 
 import functools
 import math
+import tomllib
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,19 +29,8 @@ SHOWS_ACROSS_LENGTHS = frozenset(
 )
 """Effects that one link length cannot distinguish; half of their cases have two lengths."""
 
-MIMICKED: Mapping[str, str] = {
-    'bending_stiffness': 'clamp_bending_compliance',
-    'clamp_bending_compliance': 'bending_stiffness',
-    'torsional_stiffness': 'clamp_torsional_compliance',
-    'clamp_torsional_compliance': 'torsional_stiffness',
-    'sensor_rotation': 'axis_crosstalk',
-    'self_weight': 'mount_tilt',
-    'mount_tilt': 'sensor_position of both PSDs',
-    'tip_force': 'mount_tilt',
-    'refraction': 'thermal_drift of both PSDs',
-    'axis_crosstalk': 'sensor_rotation and sensor_gain on the diagonals these loads give',
-}
-"""Effects that others can replace exactly: leaving them out leaves nothing unknown."""
+SUITE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name('suite.toml').read_text(encoding='utf-8'))
+MIMICKED: Mapping[str, str] = SUITE['mimicked']
 
 
 def histories() -> tuple[Array, Array]:
@@ -264,19 +255,8 @@ def possible(effect: Mapping[str, Any]) -> bool:
     return effect['name'] != 'second_bending_mode' or float(abs(effect['gain'])) <= 1.0
 
 
-def all_cases(
-    seeds: int = 4,
-    nulls: int = 300,
-    wrong: int = 102,
-    pairs: int = 60,
-    first: int = 0,
-    spreads: int = 60,
-    mistakes: int = 5,
-    fours: int = 40,
-    hand: int = 44,
-    sixes: int = 20,
-) -> Iterator[Case]:
-    """The whole suite. ``first``: number of the first seed, for a run on cases never seen before."""
+def all_cases(seeds: int, nulls: int, wrong: int, pairs: int, first: int, **hard: int) -> Iterator[Case]:
+    """The whole suite from seed ``first`` on; ``hard``: spreads, mistakes, fours, sixes and hand."""
     for seed in range(first, first + seeds):
         for name in EFFECTS:
             two = name in SHOWS_ACROSS_LENGTHS and seed % 2 == 1
@@ -300,10 +280,10 @@ def all_cases(
         yield Case(f'wrong-{i}', 'wrong', 'one', (), noise=NOISES[i % len(NOISES)])
     for i in range(first, first + nulls):
         yield Case(f'null-{i}', 'null', 'one', ())
-    yield from hard_cases(first, spreads, mistakes)
-    yield from cases_of_many(first, fours, 4, 20261123)
-    yield from cases_of_many(first, sixes, 6, 20261127)
-    yield from cases_by_hand(first, hand)
+    yield from hard_cases(first, hard['spreads'], hard['mistakes'])
+    yield from cases_of_many(first, hard['fours'], 4, 20261123)
+    yield from cases_of_many(first, hard['sixes'], 6, 20261127)
+    yield from cases_by_hand(first, hard['hand'])
 
 
 def cases_of_many(first: int, count: int, effects: int, seed: int) -> Iterator[Case]:
@@ -334,24 +314,7 @@ def cases_by_hand(first: int, hand: int) -> Iterator[Case]:
         yield Case(f'hand-{kind}-{i}{what}', 'hand', f'hand-{kind}-{i}', wanted, mistake=('hand', 0.0))
 
 
-MISTAKES: Mapping[str, tuple[float, ...]] = {
-    'channel_sign': (0, 1, 3, 4, 1),
-    'axis_swap': (1, 2, 1, 2, 1),
-    'psd_swap': (1, 1, 1, 1, 1),
-    'load_sign': (0, 1, 2, 1, 2),
-    'load_unit': (9.80665, 9.80665e-3, 4.4482216, 1e3, 1e-3),
-    'load_delay': (-0.2, -0.02, 0.01, 0.05, 0.3),
-    'sensitivity': (0.5, 0.95, 1.02, 1.2, 2.0),
-    'link_length': (0.9, 0.98, 1.01, 1.05, 1.15),
-    'sample_rate': (0.8, 0.95, 1.02, 1.1, 1.25),
-    'zero': (1e-6, 3e-6, 1e-5, 1e-4, 4e-4),
-    'noise_level': (0.1, 0.3, 3.0, 6.0, 10.0),
-    'load_coverage': (0.1, 0.2, 0.3, 0.4, 0.5),
-    'stuck_channel': (0.05, 0.1, 0.5, 2.0, 8.0),
-    'jump': (1e-6, 3e-6, 1e-5, 3e-5, 1e-4),
-}
-"""Mistakes of the set-up, each with five sizes: a channel, PSD or load; a factor; s, m, or a share of the time."""
-
+MISTAKES: Mapping[str, Sequence[float]] = SUITE['mistakes']
 FAULTLESS = (('gaps', 0.3), ('outliers', 0.01), ('under_load', 0.0), ('own_zeros', 3e-4))
 """Recordings that look odd and are right: share of the samples, share, nothing, m."""
 

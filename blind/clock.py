@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from blind.campaign import options, watched
-from blind.generator import Array
+from blind.generator import Array, flat_dots
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.validate.clock import Motion, Offset, clock_offset
 
-CENTERS = ((0.0, 0.07), (-0.1, 0.0))  # m, of the thesis rig.
 MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))  # Hz, and m, m, rad a step.
 
 
@@ -27,17 +26,6 @@ def truth(t: Array, steps: tuple[float, ...] = (1.0, 3.7)) -> Array:
             w = 2.0 * np.pi * hertz
             rung = 1.0 - np.exp(-0.02 * w * since) * np.cos(w * since)
             out[:, axis] += (-1.0) ** number * size * np.where(t > start, rung, 0.0)
-    return out
-
-
-def dots(poses: Array) -> Array:
-    """Dots (k, 4), m, of ``poses`` (k, 3)."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    out = np.empty((len(poses), 4))
-    for i, (x, y) in enumerate(CENTERS):
-        dx, dy = x - poses[:, 0], y - poses[:, 1]
-        out[:, 2 * i] = cos * dx + sin * dy - x
-        out[:, 2 * i + 1] = -sin * dx + cos * dy - y
     return out
 
 
@@ -72,7 +60,7 @@ def simulated(
     poses = np.mean([truth(middles + u, steps) for u in within], axis=0)
     return ClockRecording(
         t,
-        dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4)),
+        flat_dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4)),
         middles - offset,
         poses + rng.normal(0.0, REFERENCE_SD, poses.shape),
         offset,
@@ -85,7 +73,6 @@ VARIANCES = dot_noise_variances(RIG) / RIG.estimator.block_size
 
 
 def motion_of(t: Array, readings: Array) -> Motion:
-    """Return the motion as the default solver sees it."""
     return Motion(t, readings, 1e-3, lambda d: SOLVER.solve_many(d, VARIANCES).pose)
 
 
@@ -100,7 +87,6 @@ class Score:
 
 
 def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
-    """Return one run for each seed of ``runs``."""
     score = Score([])
     for seed in runs:
         run = simulated(seed, seconds=4.0, steps=(1.0, 2.7), exposure=exposure)

@@ -3,8 +3,7 @@
 """How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``."""
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from blind import generator
 from blind import motion as moving
-from blind.campaign import options
+from blind.campaign import chunk, options, over
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk, SpotMeans
@@ -170,7 +169,6 @@ def estimates(
 
 
 def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int = 1, **overrides: object) -> Scored:
-    """Return one cell of the table."""
     clean, truth = motion(rest_s, steps)
     share, burst = LOSSES[loss]
     here = generator.present(len(clean), seed + 1000, share, burst)
@@ -218,9 +216,7 @@ def on_a_moving_base(seconds: int = 60, seed: int = 1) -> Inside:
         while reported and reported[0].t_ns < int(part[-1] + 1) * 1_000_000:
             pipeline.accelerate(reported.pop(0))
         got += _published(pipeline, part, run.volts)
-    p = run.pose[: len(run.volts) // SIZE * SIZE].reshape(-1, SIZE, 3)
-    truth = (9.0 * (p[:, 9] + p[:, 10]) - p[:, 8] - p[:, 11]) / 16.0
-    error, covariance, block = _errors(got, truth)
+    error, covariance, block = _errors(got, generator.between(run.pose))
     in_motion = block >= int(moving.REST * generator.RATE) // SIZE
     return inside(error[in_motion], covariance[in_motion])
 
@@ -255,9 +251,8 @@ def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **ov
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 3)
     fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN
     pipeline = Pipeline(rig(row, **overrides))
-    seq = np.arange(n)
-    volts = volts_of(row, optics_of(fine), seed).astype(np.float32)
-    records = list(pipeline.process(RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))))
+    volts = volts_of(row, optics_of(fine), seed)
+    records = list(pipeline.process(chunk(volts)))
     got = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary and r.block >= 2 * SETTLED]
     spots = [r for r in records if isinstance(r, SpotMeans)]
     words = {s.index: next((f for f in s.findings if f.startswith('vibrates')), '') for s in spots}
@@ -268,30 +263,6 @@ def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **ov
     x, y, theta = np.median(sd, axis=0).tolist()
     reported = float(named[beyond].mean()) if beyond.any() else float('nan')
     return Shaken(inside(error, covariance), (x, y, theta), float(named.mean()), reported, words[int(block[-1])])
-
-
-def alarms(row: Row, seed: int) -> tuple[int, int]:
-    """Blocks of a faultless recording whose readings are said to contradict each other, and all its blocks. Sixty
-    seconds at rest and twelve steps, no loss."""
-    clean, _ = motion(60, 12)
-    # Before a zero the readings of a rig with offsets do contradict each other.
-    own = replace(row, offsets=())
-    pipeline = Pipeline(rig(own))
-    got = estimates(pipeline, volts_of(own, clean, seed), np.ones(len(clean), bool))
-    return pipeline.estimator.contradictions, len(got)
-
-
-def false_alarms(seeds: int, rows: int | None = None) -> int:
-    """Print the share of blocks that :func:`alarms` finds, of each row by so many seeds."""
-    counted, blocks = 0, 0
-    print('| noise | blocks | contradict |\n|---|---|---|')
-    for row in ROWS[:rows]:
-        found = [alarms(row, seed) for seed in range(2, seeds + 2)]
-        there, of = (sum(column) for column in zip(*found, strict=True))
-        print(f'| {row.label} | {of} | {there} |', flush=True)
-        counted, blocks = counted + there, blocks + of
-    print(f'{counted} of {blocks} blocks: {counted / blocks:.1e}')
-    return 0
 
 
 def coarse(poses: int = 150, seed: int = 1, *, reported: bool = True, **overrides: object) -> Inside:
@@ -324,12 +295,10 @@ def over_the_bound(
 ) -> dict[str, Array]:
     """rms error (3,) of each solver on a link at rest over :func:`bound`."""
     n = rest_s * 1000
-    volts = volts_of(row, optics_of(np.zeros((n * generator.FINER, 3))), seed).astype(np.float32)
+    volts = volts_of(row, optics_of(np.zeros((n * generator.FINER, 3))), seed)
     chosen = {'solver': solvers[0], 'solvers': list(solvers), **more}
-    seq = np.arange(n)
-    chunk = RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))
     poses: dict[str, list[tuple[float, float, float]]] = {name: [] for name in solvers}
-    for r in Pipeline(rig(row, **chosen)).process(chunk):
+    for r in Pipeline(rig(row, **chosen)).process(chunk(volts)):
         if isinstance(r, DeflectionEstimate):
             poses[r.solver].append((r.dx, r.dy, r.theta))
     return {name: np.sqrt(np.square(found).mean(axis=0)) / bound(row) for name, found in poses.items()}
@@ -423,59 +392,52 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = options(__doc__, jobs=2)
     parser.add_argument('--rows', type=int, help='only the first kinds of noise, and only the table')
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
-    parser.add_argument(
-        '--alarms', type=int, metavar='SEEDS', help='instead: false alarms of faultless rigs, each by so many seeds'
-    )
-    parser.add_argument(
-        '--vibration',
-        type=int,
-        metavar='SEEDS',
-        help='instead: a link that vibrates steadily, each tone by so many seeds',
-    )
+    parser.add_argument('--vibration', type=int, metavar='SEEDS', help='instead: steady tones, each by so many seeds')
     parser.add_argument('--faults', action='store_true', help='instead: one wrong reading after the other')
     args = parser.parse_args(argv)
     if args.faults:
         return one_wrong(args.rows)
     if args.vibration:
         return vibrations(args.vibration)
-    if args.alarms:
-        return false_alarms(args.alarms, args.rows)
     print(HEAD)
     print('|---' * (HEAD.count('|') - 1) + '|')
-    cost: Array | None = None
     motion(100, 16)
     pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
-    full = args.rows is None
-    pairs += [(row, 'none') for row in SLOW] if full else []
-    with ProcessPoolExecutor(args.jobs) as pool:
-        rough = {reported: pool.submit(coarse, reported=reported) for reported in (True, False)} if full else {}
-        for row, loss, s in pool.map(_job, pairs):
-            name = row.label if loss == 'none' else ''
-            tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
-            print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
-            if cost is None:
-                cost = np.array(s.rest.rms) / bound(row)
-        if full:
-            warm = {reported: pool.submit(warming, reported) for reported in (True, False)}
-            base = pool.submit(on_a_moving_base).result()
-            print(f'| white, moving base | none | | | | | {_cells(base)} | {base.three:.4f} | |')
-            for reported, ramp in warm.items():
-                s = ramp.result()
-                label = 'white, temperature ramp' + ('' if reported else ' that the rig file does not know')
-                tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
-                print(f'| {label} | none | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |')
-        for reported, found in rough.items():
-            r = found.result()
-            label = '10 bit, no dither' if reported else '10 bit, the rig file says 16'
-            print(f'| {label} | none | {_cells(r)} | | | | | {r.three:.4f} | |')
-    if cost is not None and full:
-        print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
-        print(f'- white, no loss: {_three(cost)}')
-        for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols')).items():
-            print(f'- unequal channels, {name}: {_three(ratio)}')
-        print()
-        vibrations(VIBRATION_SEEDS)
-    return 0
+    pairs += [(row, 'none') for row in SLOW] if args.rows is None else []
+    cost: Array | None = None
+    for row, loss, s in over(_job, pairs, args.jobs):
+        print(
+            _line(row.label if loss == 'none' else '', s.ringing.three, s.rest, s.ringing, s.alarms, loss), flush=True
+        )
+        cost = np.array(s.rest.rms) / bound(row) if cost is None else cost
+    if cost is None or args.rows is not None:
+        return 0
+    base = on_a_moving_base()
+    print(_line('white, moving base', base.three, None, base))
+    for reported, more in ((True, ''), (False, ' that the rig file does not know')):
+        s = warming(reported)
+        print(_line(f'white, temperature ramp{more}', s.ringing.three, s.rest, s.ringing, s.alarms))
+    for reported, label in ((True, '10 bit, no dither'), (False, '10 bit, the rig file says 16')):
+        r = coarse(reported=reported)
+        print(_line(label, r.three, r))
+    print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
+    print(f'- white, no loss: {_three(cost)}')
+    for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols')).items():
+        print(f'- unequal channels, {name}: {_three(ratio)}')
+    print()
+    return vibrations(VIBRATION_SEEDS)
+
+
+def _line(
+    label: str,
+    three: float,
+    rest: Inside | None,
+    ringing: Inside | None = None,
+    alarms: float = 0.0,
+    loss: str = 'none',
+) -> str:
+    shares = ' | '.join(' | | | ' if i is None else _cells(i) for i in (rest, ringing))
+    return f'| {label} | {loss} | {shares} | {three:.4f} | {alarms:.5f} |'
 
 
 def _three(ratios: Array) -> str:

@@ -12,11 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from blind.arm import Arm
-from blind.auxtel import PHYSICAL, AuxTel
-from blind.boom import Boom
 from blind.campaign import options
-from blind.emps import Emps
+from blind.machines import PHYSICAL, AuxTel, Boom, Emps
 from psd_deflection.model.simulation.declaration import Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
@@ -166,7 +163,6 @@ def nested(make: Callable[[], Plant], is_linear: bool) -> Iterator[tuple[str, fl
 
 
 def found_model(found: PlantDiscovery) -> Model:
-    """The effects and the nuisance that were found."""
     every = (*(e.active for e in found.effects), *(a for a, _ in found.nuisance))
     return {a.effect.name: dict(a.values) for a in every}
 
@@ -184,21 +180,19 @@ class Duel(NamedTuple):
     ``is_linear``: in all terms. ``test``: figures on data that no search has."""
 
     make: Callable[[Path], Plant]
+    known: Callable[[Path], Plant]
     is_linear: bool = False
-    known: Callable[[Path], Plant] | None = None
     test: Callable[[Path, Model], Iterator[tuple[str, float]]] | None = None
 
 
 DUELS: Mapping[str, Duel] = {
-    'auxtel': Duel(lambda d: AuxTel(d / 'auxtel.txt'), True, lambda d: AuxTel(d / 'auxtel.txt', known=PHYSICAL[:4])),
+    'auxtel': Duel(lambda d: AuxTel(d / 'auxtel.txt'), lambda d: AuxTel(d / 'auxtel.txt', known=PHYSICAL[:4]), True),
     'emps': Duel(lambda d: Emps(FRICTION, d / 'emps'), known=lambda d: Emps((), d / 'emps'), test=of_emps),
     'boom': Duel(lambda d: Boom(d / 'boom'), known=lambda d: Boom(d / 'boom', weighed=True)),
-    'arm': Duel(lambda d: Arm(d / 'two_link_arm')),
 }
 
 
 def answered(found: PlantDiscovery) -> str:
-    """The effects with their sizes, and whether something is unknown."""
     words = [f'`{e.active.effect.name}` {size_of(e)}' for e in found.effects]
     return '; '.join([*words, *(['the rest is called unknown'] if found.unknown else [])]) or 'nothing is missing'
 
@@ -219,8 +213,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in args.machines or DUELS:
         duel = DUELS[name]
         make = duel.known if args.null else duel.make
-        if make is None:
-            continue
         try:
             found = discover_in(make(args.data))
             print(f'| {name} | named | discover_in | {answered(found)} |', flush=True)

@@ -1,7 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A second rig simulation, written from docs/simulation.md alone; imports nothing of
-``psd_deflection.model.simulation``."""
+"""A second rig simulation, written from docs/simulation.md alone, without ``psd_deflection.model.simulation``."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 from scipy.stats import norm
 
 from blind import law_forms
@@ -147,12 +147,7 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
         total = rows.copy()
         for e in creeps:
             # The creep so far drives the oscillator, constant over a sample.
-            crept, decay = 0.0, math.exp(-1.0 / (RATE * e['time_constant']))
-            lag = np.empty(len(rows))
-            for i, u in enumerate(rows.tolist()):
-                lag[i] = crept
-                crept = u + (crept - u) * decay
-            total = total + e['amplitude'] * lag
+            total = total + e['amplitude'] * law_forms.lag(rows, e['time_constant'], 1.0 / RATE)
         states = _march(a2, b2, total[:, None], np.zeros(2))
         pose[:, axis] = states[:, 0] + sag[axis]
         if axis < 2:
@@ -169,6 +164,22 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
         speed = np.gradient(pose[:, 1], STEP)
         pose[:, 1] = pose[:, 1] + e['size'] * speed * np.abs(speed)
     return pose
+
+
+def flat_dots(poses: Array) -> Array:
+    """Dots (n, 4), m, of ``poses`` (n, 3) of a plate that stays parallel to the PSDs."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    out = np.empty((len(poses), 4))
+    for i, (lx, ly) in enumerate(PLACES):
+        x, y = lx - poses[:, 0], ly - poses[:, 1]
+        out[:, 2 * i], out[:, 2 * i + 1] = c * x + s * y - lx, c * y - s * x - ly
+    return out
+
+
+def between(poses: Array) -> Array:
+    """Poses (n / 20, 3) in the middle of each block, between two samples: by the cubic through four of them."""
+    a, b, c, d = (poses[9 + i :: 20] for i in (-1, 0, 1, 2))
+    return np.asarray((9.0 * (b + c) - a - d) / 16.0)
 
 
 def optics(
@@ -315,12 +326,7 @@ def electronics(m: Array, light: Array, t: Array, effects: Sequence[Spec]) -> Ar
         ahead = 1.0 - tau / STEP * (1.0 - decay)
         behind = 1.0 - decay - ahead
         driven = behind * fine[:-1] + ahead * fine[1:]
-        out = np.empty_like(fine)
-        y = out[0] = fine[0].copy()
-        for i, add in enumerate(driven, 1):
-            y = decay * y + add
-            out[i] = y
-        fine = out
+        fine = lfilter([1.0], [1.0, -decay], np.vstack((fine[:1], driven)), axis=0)
     volts = fine[::FINER].copy()
     at = t[::FINER]
     for e in find(effects, 'channel_skew'):
@@ -360,13 +366,13 @@ def noise(n: int, kind: str, seed: int) -> Array:
     e = rng.normal(size=(n, 6))
     if kind == 'loud':
         return 1.5 * SIGMA * e
-    if kind == 'coloured':
-        out = np.empty_like(e)
-        out[0] = e[0]
-        for i in range(1, n):
-            out[i] = 0.5 * out[i - 1] + math.sqrt(0.75) * e[i]
-        return SIGMA * out
-    return SIGMA * e
+    return SIGMA * (coloured(e, 0.5) if kind == 'coloured' else e)
+
+
+def coloured(e: Array, memory: float) -> Array:
+    """White noise (n, ...) as an autoregression: each value is ``memory`` times the last one, and something new."""
+    new = np.concatenate((e[:1], math.sqrt(1.0 - memory**2) * e[1:]))
+    return np.asarray(lfilter([1.0], [1.0, -memory], new, axis=0))
 
 
 def flicker(n: int, corner: float, rng: np.random.Generator) -> Array:
@@ -392,17 +398,10 @@ def jitter(volts: Array, effects: Sequence[Spec], seed: int) -> Array:
 def electronic_noise(
     n: int, seed: int, *, sigmas: Sequence[float] = (SIGMA,) * 6, memory: float = 0.0, heavy: bool = False
 ) -> Array:
-    """(n, 6) V of rms ``sigmas``: each sample is ``memory`` times the last one and something new (AR(1))."""
+    """(n, 6) V of rms ``sigmas``, with a ``memory`` as :func:`coloured` has it."""
     rng = np.random.default_rng(seed)
     new = rng.standard_t(4, size=(n, 6)) / math.sqrt(2.0) if heavy else rng.normal(size=(n, 6))
-    if memory:
-        out = np.empty_like(new)
-        before = out[0] = new[0]
-        fresh = math.sqrt(1.0 - memory**2)
-        for i in range(1, n):
-            before = out[i] = memory * before + fresh * new[i]
-        new = out
-    return np.asarray(new * np.asarray(sigmas))
+    return np.asarray((coloured(new, memory) if memory else new) * np.asarray(sigmas))
 
 
 def present(n: int, seed: int, share: float = 0.0, burst: int = 0) -> npt.NDArray[np.bool_]:

@@ -1,7 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The cases of the blind suite as files, for any tool. ``python -m blind.given --out DIR``; then ``blind.run
---score``."""
+"""The cases of the blind suite as files, for any tool: ``python -m blind.given --out DIR``."""
 
 import json
 import sys
@@ -48,7 +47,6 @@ def given(job: tuple[Case, str, str]) -> str:
 
 
 def main() -> int:
-    """Seal the truths, write the cases."""
     parser = options(__doc__, jobs=1)
     chosen = selection(parser)
     args = parser.parse_args()

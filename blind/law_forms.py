@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
@@ -92,13 +93,10 @@ def truth_of(law: Spec) -> dict[str, Any]:
     }
 
 
-def _lag(u: Array, tau: float, step: float) -> Array:
-    out = np.empty_like(u)
-    y, decay = 0.0, math.exp(-step / tau)
-    for i, v in enumerate(u.tolist()):
-        out[i] = y
-        y = v + (y - v) * decay
-    return out
+def lag(u: Array, tau: float, step: float) -> Array:
+    """What follows ``u`` (n,) with the time constant ``tau``, from 0, each input held for a step."""
+    decay = math.exp(-step / tau)
+    return np.asarray(lfilter([0.0, 1.0 - decay], [1.0, -decay], u))
 
 
 def _mode(u: Array, frequency: float, step: float) -> Array:
@@ -161,7 +159,7 @@ def added(law: Spec, known: Mapping[str, Array], t: Array, step: float) -> Array
         speed = np.gradient(u, step)
         out = speed * np.abs(speed) if form == 'drag' else speed
     elif form == 'fading_square':
-        out = _lag(u**2, law['time_constant'], step)
+        out = lag(u**2, law['time_constant'], step)
     elif form == 'stick':
         out = _stuck(u, 0.1 * b)
     elif form == 'resonance':

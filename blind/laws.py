@@ -78,7 +78,6 @@ def sized(law: dict[str, Any]) -> dict[str, Any]:
 
 
 def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
-    """Return the recording with the law, or one in which nothing is missing."""
     (g,) = designs('one')
     volts = g.record([] if law is None else [law], 'white', seed)
     return [Observation('recording', load_rig(), volts, g.loads, g.temperature)]
@@ -90,7 +89,6 @@ def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Disco
 
 
 def evaluated(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
-    """How the answer compares with the truth."""
     message = next((u['law'] for u in got['unknown'] if u['law']), None)
     row: dict[str, Any] = {'verdict': got['verdict'], 'law': None if message is None else message['expression']}
     row['effects'] = [e['name'] for e in got['effects']]
@@ -153,7 +151,6 @@ def _answer_to_law(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
-    """Return the counts against what is wanted."""
     laws, nulls = [r for r in rows if 'truth' in r], [r for r in rows if 'truth' not in r]
     lines, passed = [], True
     for name, words in (('stage', 'right stage'), ('variables', 'right variables')):
@@ -184,7 +181,6 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Draw, let discover answer, count; exit status 1 if a threshold is missed."""
     parser = options(__doc__, jobs=1)
     parser.add_argument('--out', default='build/blind-laws', help='folder for the answers (default: build/blind-laws)')
     parser.add_argument('--laws', type=int, default=12)

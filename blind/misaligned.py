@@ -46,15 +46,17 @@ def draw(rng: np.random.Generator) -> dict[str, float]:
     """Return one rig. ``beam_N.x``, ``.y``: where the beam meets the unloaded plate, from the nominal centre, m."""
     out = nominal()
     for name in out:
-        kind = name.partition('.')[2]
-        if name == 'link.slope_ratio':
-            spread = SLOPE[1]
-        elif name.startswith('beam'):
-            spread = BEAM_ANGLE if kind.startswith('angle') else BEAM_PLACE
-        else:
-            spread = SPREADS[kind]
-        out[name] += float(rng.normal(0.0, spread))
+        out[name] += float(rng.normal(0.0, tolerance(name)))
     return out
+
+
+def tolerance(name: str) -> float:
+    kind = name.partition('.')[2]
+    if name == 'link.slope_ratio':
+        return SLOPE[1]
+    if name.startswith('beam'):
+        return BEAM_ANGLE if kind.startswith('angle') else BEAM_PLACE
+    return SPREADS[kind]
 
 
 def dots(rig: Mapping[str, float], pose: Array) -> Array:
@@ -142,7 +144,6 @@ def draw_light(rng: np.random.Generator) -> tuple[Light, Light]:
 
 
 def relit(light: tuple[Light, Light], rng: np.random.Generator) -> tuple[Light, Light]:
-    """Return the same amplifiers in other light."""
     first, second = (
         new._replace(**{n: getattr(old, n) for n in OFFSETS}) for new, old in zip(draw_light(rng), light, strict=True)
     )

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.signal import savgol_filter
+from scipy.signal import lfilter, savgol_filter
 from scipy.stats import chi2
 
-from blind.campaign import options, watched
-from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, output
+from blind.campaign import chunk, options, watched
+from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, flat_dots, output
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.records import BaseAcceleration, RawChunk, TipMotion
+from psd_deflection.records import BaseAcceleration, TipMotion
 from psd_deflection.rig.config import Rig, load_rig
 
 LENGTH = 0.585
@@ -69,10 +69,8 @@ def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
         for axis in range(3):
             # A force that forgets in 0.2 s.
             kept = math.exp(-1.0 / (RATE * 0.2))
-            held = 0.0
-            for i, new in enumerate(rng.normal(0.0, 0.2 * most[axis] * math.sqrt(1.0 - kept * kept), n - rest), rest):
-                held = kept * held + new
-                out[i, axis] = held
+            new = rng.normal(0.0, 0.2 * most[axis] * math.sqrt(1.0 - kept * kept), n - rest)
+            out[rest:, axis] = lfilter([1.0], [1.0, -kept], new)
     return out
 
 
@@ -151,7 +149,6 @@ def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple
 
 
 def make(kind: str, seconds: float, seed: int) -> Run:
-    """Return a run of ``kind``."""
     rng = np.random.default_rng(seed)
     if kind in ('joint', UNTOLD):
         pose, velocity, reported = swung(seconds, rng)
@@ -161,7 +158,6 @@ def make(kind: str, seconds: float, seed: int) -> Run:
 
 
 def run_of(loads: Array, seed: int) -> Run:
-    """Return the run under ``loads`` (n, 3)."""
     pose, velocity = moved(loads)
     return Run(loads, pose, velocity, volts_of(pose, np.random.default_rng([seed, 1])))
 
@@ -178,12 +174,8 @@ def biased(run: Run, share: float) -> Run:
 
 def volts_of(pose: Array, rng: np.random.Generator) -> Array:
     """Readings (n, 6) of the poses (n, 3), with the rig's noise and converter."""
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     volts = np.full((len(pose), 6), 5.0)
-    for psd, (lx, ly) in enumerate(PLACES):
-        x, y = lx - pose[:, 0], ly - pose[:, 1]
-        volts[:, 3 * psd] = (c * x + s * y - lx) / MM_PER_V
-        volts[:, 3 * psd + 1] = (c * y - s * x - ly) / MM_PER_V
+    volts[:, [0, 1, 3, 4]] = flat_dots(pose) / MM_PER_V
     return output(volts + rng.normal(0.0, SIGMA, volts.shape), [])
 
 
@@ -206,14 +198,7 @@ class Result:
     unseen: Array
 
 
-def chunk(run: Run, block: int) -> RawChunk:
-    """Block number ``block`` of the run."""
-    seq = np.arange(block * BLOCK, (block + 1) * BLOCK)
-    return RawChunk(seq, seq * 1_000_000, run.volts[seq].astype(np.float32), np.zeros(BLOCK, np.uint8))
-
-
 def rig_of(changes: Mapping[str, object] | None = None) -> Rig:
-    """Return the thesis rig with its filter."""
     return load_rig(None, {'filter': 'modal', 'solvers': ['exact'], **(changes or {})})
 
 
@@ -269,7 +254,8 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
         before = motion.innovations
         while reported and there(reported[0]) < BLOCK * (block + 1):
             pipeline.accelerate(reported.pop(0))
-        for record in pipeline.process(chunk(run, block)):
+        volts = run.volts[BLOCK * block : BLOCK * (block + 1)]
+        for record in pipeline.process(chunk(volts, BLOCK * block)):
             if isinstance(record, TipMotion):
                 at = BLOCK * (block + 1) - 1
                 velocity[block] = np.array([record.vx, record.vy, record.vtheta]) - run.velocity[at]
@@ -322,7 +308,6 @@ class Figures:
 
 
 def figures(results: Iterable[Result]) -> list[Figures]:
-    """Of dX, dY and theta, over all ``results``."""
     results = list(results)
     low, high = (float(chi2.ppf(p, BLOCK)) for p in (0.025, 0.975))
     out = []

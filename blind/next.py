@@ -47,7 +47,6 @@ def first_recordings() -> dict[str, tuple[Array, Array]]:
 def observed(
     truth: Sequence[dict[str, Any]], loads: Array, temperature: Array | None, length: float, seed: int, name: str
 ) -> Observation:
-    """Return a recording of the second generator."""
     steady = np.full(len(loads), 20.0) if temperature is None else temperature
     volts = Generator(loads, steady, length).record(truth, 'white', seed)
     own = replace_values(RIG, {'link.length': length}) if length != RIG.link.length else RIG
@@ -114,7 +113,6 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
-    """What came out, as text, and whether it is what is wanted."""
     lines = []
     of = [r for r in rows if r['kind'] == 'confounded']
     ended = [r for r in of if r['outcome'] == 'limits']
@@ -147,7 +145,6 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the campaign; exit status 1 if what is wanted is not met."""
     parser = options(__doc__, jobs=1)
     parser.add_argument('--only', default='', help='only effects whose name contains this')
     parser.add_argument('--designs', default='', help='only first recordings whose name contains this')

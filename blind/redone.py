@@ -4,7 +4,6 @@
 
 import base64
 import contextlib
-import csv
 import html
 import io
 import itertools
@@ -31,6 +30,7 @@ from psd_deflection.base.pages import page
 from psd_deflection.base.pages import table as table_of
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.cli.main import main as psd_deflection
+from psd_deflection.records import CHANNELS
 from psd_deflection.rig.parameter_files import with_values
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -175,10 +175,7 @@ def record(made: Bench, load_case: HeldLoad) -> None:
     pose = motion(plan, load_case)
     t = np.arange(len(pose)) / generator.RATE
     volts = misaligned.record(made.truth, pose, rng).volts
-    with (made.folder / f'{load_case.name}.csv').open('w', newline='') as stream:
-        rows = csv.writer(stream)
-        rows.writerow(('t', 'x1', 'y1', 'sum1', 'x2', 'y2', 'sum2'))
-        rows.writerows([f'{s:.9f}', *(f'{v:.9g}' for v in row)] for s, row in zip(t, volts.tolist(), strict=True))
+    save(made.folder / f'{load_case.name}.csv', ('t', *CHANNELS), np.column_stack((t, volts)))
     at = CubicSpline(t, pose)
     k = made.truth['link.slope_ratio'] / misaligned.LENGTH
 
@@ -190,7 +187,7 @@ def record(made: Bench, load_case: HeldLoad) -> None:
     images.mkdir()
     cv2 = opencv()
     starts = np.arange(0.02, t[-1] - 0.02, 1.0 / plan.rate)
-    listed, true = [], []
+    listed, true = ['file,t,exposure'], []
     still = render.clean(made.scene, [render.Pose()])
     for number, start in enumerate(starts.tolist()):
         poses = render.over_exposure(observed, start, plan.exposure, plan.instants)
@@ -198,37 +195,27 @@ def record(made: Bench, load_case: HeldLoad) -> None:
         image = render.developed(made.scene, still if rests else render.clean(made.scene, poses), rng)
         name = f'{number:04}.png'
         cv2.imwrite(str(images / name), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        listed.append((name, f'{start + CLOCK:.9f}', plan.exposure))
-        true.append((f'{start + plan.exposure / 2:.9f}', *render.mean_of(poses)))
-    for path, head, lines in (
-        (images / 'frames.csv', ('file', 't', 'exposure'), listed),
-        (made.folder / f'{load_case.name}_truth.csv', ('t', *AXES), true),
-    ):
-        with path.open('w', newline='') as stream:
-            csv.writer(stream).writerows([head, *lines])
+        listed.append(f'{name},{start + CLOCK:.9f},{plan.exposure}')
+        true.append((start + plan.exposure / 2, *render.mean_of(poses)))
+    (images / 'frames.csv').write_text('\n'.join(listed) + '\n')
+    save(made.folder / f'{load_case.name}_truth.csv', ('t', *AXES), np.array(true))
 
 
 def table(path: Path) -> dict[str, Array]:
     """Columns of a CSV; what is empty or a word is NaN."""
+    rows = np.genfromtxt(path, delimiter=',', names=True, dtype=np.float64)
+    return {name: rows[name] for name in rows.dtype.names or ()}
 
-    def number(cell: str) -> float:
-        try:
-            return float(cell)
-        except ValueError:
-            return math.nan
 
-    with path.open(newline='') as stream:
-        head, *rows = csv.reader(stream)
-    return {name: np.array([number(row[i]) for row in rows]) for i, name in enumerate(head)}
+def save(path: Path, head: Sequence[str], rows: Array) -> None:
+    np.savetxt(path, rows, '%.9g', ',', header=','.join(head), comments='')
 
 
 def zeroed(made: Bench, name: str) -> dict[str, object]:
     """Return the zero before the load, as ~/zero takes it: the mean reading of the unloaded link, m."""
     rows = table(made.folder / f'{name}.csv')
-    rest = rows['t'] < 0.9 * made.plan.rest
-    return {
-        f'psd_{n}.zero': [float(rows[f'{axis}{n}'][rest].mean() * generator.MM_PER_V) for axis in 'xy'] for n in (1, 2)
-    }
+    at = {n: float(v[rows['t'] < 0.9 * made.plan.rest].mean() * generator.MM_PER_V) for n, v in rows.items()}
+    return {f'psd_{n}.zero': [at[f'x{n}'], at[f'y{n}']] for n in (1, 2)}
 
 
 def rig_files(made: Bench, stem: str, values: Mapping[str, object]) -> None:
@@ -245,16 +232,13 @@ def rig_files(made: Bench, stem: str, values: Mapping[str, object]) -> None:
 def curves(made: Bench, load_case: HeldLoad, stem: str) -> Curves:
     """What every method says of a recording with the rig file ``STEM.yaml``, by ``replay``."""
     found: dict[str, Array] = {}
-    t = np.empty(0)
     for variant in ('', *(f'_{place}' for place in WEIGHTS)):
         out = f'{load_case.name}_{stem}{variant}.csv'
         made.run('replay', f'{load_case.name}.csv', '--params-file', f'{stem}{variant}.yaml', '--out', out)
         rows = table(made.folder / out)
-        t = rows['t']
         for name in ('wls',) if variant else ('wls', 'iterative', 'exact'):
-            label = f'{name}{variant}'
-            found[label] = np.column_stack([rows[f'{name}_{axis}'] for axis in AXES])
-    return Curves(t, found)
+            found[f'{name}{variant}'] = np.column_stack([rows[f'{name}_{axis}'] for axis in AXES])
+    return Curves(rows['t'], found)
 
 
 def evaluated(made: Bench, load_case: HeldLoad, stem: str, by: str) -> Any:
@@ -267,7 +251,6 @@ def evaluated(made: Bench, load_case: HeldLoad, stem: str, by: str) -> Any:
 
 
 def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
-    """``calibrate`` on some recordings: ``STEM.yaml``; what it says."""
     references = itertools.chain.from_iterable(('--reference', f'{h.name}_camera.csv') for h in runs)
     message = made.run(
         'calibrate',
@@ -355,9 +338,8 @@ def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: M
             solver, _, weights = method.partition('_')
             cells = []
             for force in forces:
-                found = answers[f'link_{force:.0f}N'][f'{stem}{"_" if weights else ""}{weights} truth']['solvers'][
-                    solver
-                ]
+                answer = answers[f'link_{force:.0f}N'][f'{stem}{"_" if weights else ""}{weights} truth']
+                found = answer['solvers'][solver]
                 cells += [f'{100 * found[axis]["largest"] / scale[axis]:.3f}' for axis in SYMBOLS]
             rows.append((words if method == 'wls_sidebar' else '', label, *cells))
     head = [f'{force:.0f} N, {SYMBOLS[axis]}' for force in forces for axis in SYMBOLS]
@@ -406,7 +388,6 @@ def _body(
     cameras: Mapping[str, Mapping[str, Array]],
     answers: Mapping[str, Mapping[str, Any]],
 ) -> Iterator[str]:
-    """The page: figures 5.12 to 5.29 and Table 5.1 of the thesis anew."""
     largest = f'sidebar_right_{made.plan.forces[0]:.0f}N'
     code = base64.b64encode((made.folder / f'{largest}.png').read_bytes()).decode()
     words = ', '.join(f'{symbol} {100 * summary["shares"]["after"][axis]:.3f} %' for axis, symbol in SYMBOLS.items())
@@ -439,7 +420,6 @@ def _body(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Do it, and say where the page is."""
     parser = options(__doc__)
     parser.add_argument('--out', type=Path, default=Path('build/thesis'), help='a new folder (default %(default)s)')
     parser.add_argument('--seed', type=int, default=1, help='of the rig')

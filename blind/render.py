@@ -55,12 +55,10 @@ class Scene:
 
     @property
     def matrix(self) -> list[float]:
-        """Camera matrix, row by row."""
         return [self.focal, 0.0, self.centre[0], 0.0, self.focal, self.centre[1], 0.0, 0.0, 1.0]
 
 
 def about(axis: int, angle: float) -> Array:
-    """Return a turn about one axis."""
     c, s = math.cos(angle), math.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     out = np.eye(3)
@@ -70,7 +68,6 @@ def about(axis: int, angle: float) -> Array:
 
 
 def camera_of(scene: Scene) -> tuple[Array, Array]:
-    """Rotation and origin of the rest frame in the camera's axes."""
     facing = np.diag([1.0, -1.0, -1.0]) if scene.view == 'outside' else np.diag([-1.0, -1.0, 1.0])
     rotation = about(2, scene.turn) @ about(0, scene.tilt[0]) @ about(1, scene.tilt[1]) @ facing
     return rotation, np.array([scene.aim[0], scene.aim[1], scene.distance])
@@ -221,7 +218,6 @@ def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
 
 
 def photograph(scene: Scene, poses: Sequence[Pose], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """Return one frame as the camera gives it."""
     return developed(scene, clean(scene, poses), rng)
 
 
@@ -268,7 +264,6 @@ def over_exposure(motion: Callable[[float], Pose], t: float, exposure: float, in
 
 
 def mean_of(poses: Sequence[Pose]) -> tuple[float, float, float]:
-    """Return the mean of dX, dY, theta."""
     return (
         float(np.mean([p.dx for p in poses])),
         float(np.mean([p.dy for p in poses])),

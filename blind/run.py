@@ -22,6 +22,19 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
 
+COUNTS = (
+    ('seeds', 4, 'draws of each effect and gap'),
+    ('nulls', 300, 'without an effect'),
+    ('wrong', 102, 'the same, with other noise'),
+    ('pairs', 60, 'two effects'),
+    ('spreads', 60, 'pairs and triples of very different size'),
+    ('mistakes', 5, 'sizes of each mistake of the set-up'),
+    ('fours', 40, 'four effects at once'),
+    ('sixes', 20, 'six effects at once'),
+    ('hand', 44, 'loads applied and noted by hand'),
+    ('first', 0, 'number of the first seed: fresh cases'),
+)
+"""Options of the selection: so many cases."""
 _BANKS: dict[str, SignatureBank] = {}
 
 
@@ -59,36 +72,33 @@ def _rig(case: Case, observed: Sequence[Observation]) -> Rig:
     return observed[0].rig if case.mistake[0] else load_rig()
 
 
-def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
-    fields, truth, target = job
-    case = Case(
-        **{
-            **fields,
-            'wanted': tuple(map(tuple, fields['wanted'])),
-            'without': tuple(fields['without']),
-            'mistake': tuple(fields['mistake']),
-        }
-    )
+def _answer_case(job: tuple[Case, Path]) -> None:
+    case, folder = job
+    path = folder / 'answers' / f'{case.key}.json'
+    if path.exists():
+        return
+    truth = json.loads((folder / 'sealed' / path.name).read_text())['truth']
     start = time.perf_counter()
     got, _ = answer(case, truth)
     got['seconds'] = time.perf_counter() - start
-    path = Path(target)
+    _write(path, json.dumps(got))
+
+
+def _write(path: Path, text: str) -> None:
+    """The file is whole, or it is not there."""
     partial = path.with_suffix('.partial')
-    partial.write_text(json.dumps(got))
+    partial.write_text(text)
     partial.replace(path)
-    return case.key
 
 
 def _sealed(given: tuple[Case, Path]) -> None:
     case, path = given
     if path.exists():
         return
-    partial = path.with_suffix('.partial')
     sealed = {'case': dataclasses.asdict(case), 'truth': truth_of(case)}
     if case.kind == 'hand':
         sealed['wrong'] = byhand.drawn(case.design).wrong
-    partial.write_text(json.dumps(sealed, sort_keys=True))
-    partial.replace(path)
+    _write(path, json.dumps(sealed, sort_keys=True))
 
 
 def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
@@ -110,28 +120,19 @@ def selection(parser: argparse.ArgumentParser) -> Callable[[argparse.Namespace],
     """Return the options that choose cases, added to ``parser``, and what gives these of the parsed ones."""
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
     parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
-    parser.add_argument('--seeds', type=int, default=4)
-    parser.add_argument('--nulls', type=int, default=300)
-    parser.add_argument('--wrong', type=int, default=102)
-    parser.add_argument('--pairs', type=int, default=60)
-    parser.add_argument('--spreads', type=int, default=60, help='pairs and triples of very different size')
-    parser.add_argument('--mistakes', type=int, default=5, help='sizes of each mistake of the set-up')
-    parser.add_argument('--fours', type=int, default=40, help='four effects at once')
-    parser.add_argument('--sixes', type=int, default=20, help='six effects at once')
-    parser.add_argument('--hand', type=int, default=44, help='loads hung and noted by hand')
-    parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
+    for name, default, words in COUNTS:
+        parser.add_argument(f'--{name}', type=int, default=default, help=f'{words} (default: %(default)s)')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
 
     def chosen(args: argparse.Namespace) -> list[Case]:
-        counts = (args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours)
-        listed = short_cases() if args.short else all_cases(*counts, args.hand, args.sixes)
+        counts = {name: getattr(args, name) for name, *_ in COUNTS}
+        listed = short_cases() if args.short else all_cases(**counts)
         return [c for c in listed if args.only in c.key]
 
     return chosen
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
     parser = options(__doc__, jobs=1)
     chosen = selection(parser)
     parser.add_argument('--score', action='store_true', help='only score the answers that are there, of any tool')
@@ -144,13 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cases = chosen(args)
     print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
     (folder / 'answers').mkdir(parents=True, exist_ok=True)
-    jobs = []
-    for case in cases:
-        target = folder / 'answers' / f'{case.key}.json'
-        if not target.exists():
-            sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
-            jobs.append((sealed['case'], sealed['truth'], str(target)))
-    for _ in over(_answer_case, jobs, args.jobs, 'answers'):
+    for _ in over(_answer_case, [(case, folder) for case in cases], args.jobs, 'answers'):
         pass
     return conclude(*score.summary(score.load(folder, [c.key for c in cases])), summary)
 

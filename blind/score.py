@@ -2,41 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scores of the blind suite: against thresholds that were fixed beforehand, with intervals."""
 
+import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from blind.campaign import bound_line
-from blind.cases import SHOWS_ACROSS_LENGTHS
+from blind.cases import SHOWS_ACROSS_LENGTHS, SUITE
+from psd_deflection.records import CHANNELS
 
-THRESHOLDS: dict[str, float] = {
-    'named_or_equivalent': 0.95,
-    'mean_set_size': 1.7,
-    'named_first_where_separated': 0.95,
-    'false_alarm_right_noise': 0.01,
-    'false_alarm_wrong_noise': 0.03,
-    'both_of_a_pair': 0.85,
-    'unknown': 0.90,
-    'all_of_a_spread': 0.95,
-    'all_of_four': 0.85,
-    'all_of_six': 0.6,
-    'unsaid_floors': 1.5,
-    'mistake_named': 0.95,
-    'hand_effect': 0.95,
-    'hand_line': 0.98,
-    'heldout_over_floor_median': 1.05,
-    'heldout_over_floor_p95': 1.2,
-    'coverage_low': 0.92,
-    'coverage_high': 0.98,
-    'forward_simulations': 2000,
-    'forward_simulations_several': 6000,
-}
+THRESHOLDS: Mapping[str, float] = SUITE['thresholds']
 
 
 @dataclass(frozen=True)
@@ -54,12 +35,10 @@ class Row:
 
     @property
     def named(self) -> list[str]:
-        """Names in the answer, in order."""
         return [e['name'] for e in self.answer['effects']]
 
     @property
     def sets(self) -> list[set[str]]:
-        """Each named effect with its equivalents."""
         return [{e['name'], *e['equivalent']} for e in self.answer['effects']]
 
 
@@ -82,37 +61,24 @@ def complete(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def load(folder: Path, keys: Sequence[str]) -> list[Row]:
-    """Return every case that has an answer."""
     out = []
     for key in keys:
         answer = folder / 'answers' / f'{key}.json'
         if not answer.exists():
             continue
         sealed = json.loads((folder / 'sealed' / f'{key}.json').read_text())
-        case = sealed['case']
+        case, found = sealed['case'], complete(json.loads(answer.read_text()))
         gap = max((g for _, g in case['wanted']), default=0.0)
         apart = case['design'] == 'two' or not any(n in SHOWS_ACROSS_LENGTHS for n, _ in case['wanted'])
-        mistake = case.get('mistake', ['', 0.0])[0]
-        out.append(
-            Row(
-                key,
-                case['kind'],
-                gap,
-                apart,
-                sealed['truth'],
-                complete(json.loads(answer.read_text())),
-                mistake,
-                tuple(sealed.get('wrong', ())),
-            )
-        )
+        wrong = tuple(sealed.get('wrong', ()))
+        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], found, case['mistake'][0], wrong))
     return out
 
 
-def interval(k: int, n: int) -> tuple[float, float]:
-    """Clopper-Pearson, 95 %."""
-    low = float(beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
-    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
-    return low, high
+def share(k: int, n: int) -> str:
+    """k of n, with the interval of Clopper and Pearson, 95 %."""
+    found = binomtest(k, n).proportion_ci()
+    return f'{100 * k / n:.1f} % ({k}/{n}; 95 %: {100 * found.low:.1f} to {100 * found.high:.1f})'
 
 
 def covered(row: Row) -> list[tuple[str, bool]]:
@@ -139,9 +105,6 @@ def covered(row: Row) -> list[tuple[str, bool]]:
     return out
 
 
-CHANNELS = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
-
-
 class _Sheet:
     """The lines of a summary, and whether all thresholds hold."""
 
@@ -150,6 +113,10 @@ class _Sheet:
         self.failures: list[str] = []
         self.passed = True
 
+    def miss(self, rows: Sequence[Row], wrong: Sequence[bool]) -> None:
+        """Those of ``rows`` that are ``wrong`` are failures."""
+        self.failures += [f'{r.key}: {_row_words(r)}' for r in itertools.compress(rows, wrong)]
+
     def check(self, good: bool, text: str) -> None:
         self.passed = self.passed and good
         self.lines.append(f'  {bound_line(good, " " + text)}')
@@ -157,19 +124,15 @@ class _Sheet:
     def rate(self, name: str, rows: Sequence[Row], hits: Sequence[bool], low: float, high: float, note: bool) -> None:
         """The share of ``hits``, wanted from ``low`` to ``high``; with ``note``, misses go to the failures."""
         if note:
-            self.failures += [f'{r.key}: {_row_words(r)}' for r, h in zip(rows, hits, strict=True) if not h]
+            self.miss(rows, [not hit for hit in hits])
         n, k = len(hits), sum(hits)
         if n == 0:
             self.lines.append(f'  --    {name}: no cases')
             return
-        a, b = interval(k, n)
-        wanted = f'wanted {100 * low:g} to {100 * high:g} %'
-        text = f'{name}: {100 * k / n:.1f} % ({k}/{n}; 95 %: {100 * a:.1f} to {100 * b:.1f}), {wanted}'
-        self.check(low <= k / n <= high, text)
+        self.check(low <= k / n <= high, f'{name}: {share(k, n)}, wanted {100 * low:g} to {100 * high:g} %')
 
 
 def summary(rows: Sequence[Row]) -> tuple[str, bool]:
-    """The report and whether every threshold holds."""
     sheet = _Sheet()
     single = [r for r in rows if r.kind == 'single' and r.gap >= 3.0]
     _detections(sheet, single)
@@ -211,7 +174,7 @@ def _false_alarms(sheet: _Sheet, rows: Sequence[Row]) -> None:
     for kind, name in (('null', 'right'), ('wrong', 'wrong')):
         of = [r for r in rows if r.kind == kind]
         alarm = [r.answer['verdict'] != 'nothing_missing' for r in of]
-        sheet.failures += [f'{r.key}: {_row_words(r)}' for r, a in zip(of, alarm, strict=True) if a]
+        sheet.miss(of, alarm)
         sheet.rate(f'false alarm, {name} noise', of, alarm, 0.0, THRESHOLDS[f'false_alarm_{name}_noise'], False)
 
 
@@ -231,19 +194,19 @@ def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
 
 def _score_spreads(sheet: _Sheet, rows: Sequence[Row]) -> None:
     """Effects of very different size: all are named, and nothing above the noise is left unsaid in any answer."""
-    of = [r for r in rows if r.kind == 'spread']
-    hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
-    sheet.rate('all of a pair or triple of 1:10:100 floors', of, hits, THRESHOLDS['all_of_a_spread'], 1.0, True)
-    for kind in ('four', 'six'):
+    for kind, words in (
+        ('spread', 'all of a pair or triple of 1:10:100 floors'),
+        ('four', 'all of four effects at once, 3 to 30 floors'),
+        ('six', 'all of six effects at once, 3 to 30 floors'),
+    ):
         of = [r for r in rows if r.kind == kind]
-        hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
-        sheet.rate(f'all of {kind} effects at once, 3 to 30 floors', of, hits, THRESHOLDS[f'all_of_{kind}'], 1.0, True)
+        sheet.rate(words, of, [_names_all(r) for r in of], THRESHOLDS[f'all_of_{kind}'], 1.0, True)
     of = [r for r in rows if r.kind in ('single', 'pair', 'spread', 'four', 'six')]
     sheet.rate('an effect named that is none', of, [_names_none(r) for r in of], 0.0, 0.0, False)
-    sheet.failures += [f'{r.key}: {_row_words(r)}' for r in of if _names_none(r)]
+    sheet.miss(of, [_names_none(r) for r in of])
     most = THRESHOLDS['unsaid_floors']
     unreported = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
-    sheet.failures += [f'{r.key}: {_row_words(r)}' for r in unreported]
+    sheet.miss(unreported, [True] * len(unreported))
     sheet.check(not unreported, f'answers that leave more than {most} floors unsaid: {len(unreported)}, wanted 0')
 
 
@@ -259,7 +222,7 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     sheet.rate('mistake named where there is none', sound, [bool(s) for s in message], 0.0, 0.0, False)
     odd = [r for r in rows if r.kind == 'faultless']
     alarm = [r.answer['verdict'] != 'nothing_missing' for r in odd]
-    sheet.failures += [f'{r.key}: {_row_words(r)}' for r, wrong in zip(odd, alarm, strict=True) if wrong]
+    sheet.miss(odd, alarm)
     sheet.rate('false alarm, gaps, outliers, start under load, own zeros', odd, alarm, 0.0, 0.01, False)
 
 
@@ -290,7 +253,7 @@ def _score_by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
     if not of:
         return
     reported = [[_reported(w, r.answer['setup']) for w in r.wrong] for r in of]
-    found = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
+    found = [_names_all(r) for r in of]
     false = [_names_none(r) for r in of]
     unknown = [r.answer['verdict'] == 'unknown_effect' for r in of]
     some = [i for i, r in enumerate(of) if r.wrong]
@@ -338,10 +301,12 @@ def _curve(rows: Sequence[Row]) -> list[str]:
     for gap in sorted({r.gap for r in rows if r.kind == 'single'}):
         of = [r for r in rows if r.kind == 'single' and r.gap == gap]
         k = sum(any(r.truth[0]['name'] in s for s in r.sets) for r in of)
-        low, high = interval(k, len(of))
-        share = f'{100 * k / len(of):5.1f} % ({k}/{len(of)}; 95 %: {100 * low:.1f} to {100 * high:.1f})'
-        lines.append(f'  {gap:5.1f} floors: {share}')
+        lines.append(f'  {gap:5.1f} floors: {share(k, len(of))}')
     return lines
+
+
+def _names_all(r: Row) -> bool:
+    return all(any(t['name'] in s for s in r.sets) for t in r.truth)
 
 
 def _names_none(r: Row) -> bool:
@@ -351,10 +316,8 @@ def _names_none(r: Row) -> bool:
 
 
 def _both(row: Row) -> bool:
-    wanted = [t['name'] for t in row.truth]
-    a, b = wanted
-    sets = row.sets
-    return any(a in sets[i] and b in sets[j] for i in range(len(sets)) for j in range(len(sets)) if i != j)
+    a, b = (t['name'] for t in row.truth)
+    return any(a in one and b in other for one, other in itertools.permutations(row.sets, 2))
 
 
 def _row_words(row: Row) -> str:

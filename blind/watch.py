@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blind.campaign import conclude, options, over
+from blind.campaign import chunk, conclude, options, over
 from blind.generator import EI, GJ, LSB, MM_PER_V, SIGMA, Array, Generator
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm, Watch
 from psd_deflection.model.solvers.registry import solver_from_rig
-from psd_deflection.records import AppliedLoad, BlockStatus, DeflectionEstimate, RawChunk, Record, SpotMeans, TipLoad
+from psd_deflection.records import AppliedLoad, BlockStatus, DeflectionEstimate, Record, SpotMeans, TipLoad
 from psd_deflection.rig.config import load_rig
 
 RATE, LENGTH = 1000, 0.585
@@ -41,8 +41,6 @@ class Run(NamedTuple):
 
 
 class Chain:
-    """Pipeline and watch, fed with volts."""
-
     def __init__(self) -> None:
         rig = load_rig(overrides={'solvers': ['exact']})
         self.pipeline = Pipeline(rig)
@@ -51,16 +49,12 @@ class Chain:
         self.raised: list[Alarm] = []
 
     def load(self, load: Array | Sequence[float]) -> None:
-        """A load that is noted now."""
         self.watch.note(AppliedLoad(self.at * 1_000_000, *map(float, load)))
 
     def feed(self, volts: Array) -> None:
-        """The next samples (n, 6) V."""
-        seq = np.arange(self.at, self.at + len(volts), dtype=np.int64)
-        chunk = RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), dtype=np.uint8))
+        before, samples = self.watch.alarms, chunk(volts, self.at)
         self.at += len(volts)
-        before = self.watch.alarms
-        for record in self.pipeline.process(chunk):
+        for record in self.pipeline.process(samples):
             self.watch.put(record)
         if self.watch.alarms > before and self.watch.alarm is not None:
             self.raised.append(self.watch.alarm)
@@ -95,7 +89,6 @@ def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
 
 
 def watch_run(job: tuple[str, int]) -> Run:
-    """Return one event of a kind, drawn by ``seed``, seen by the whole chain."""
     kind, seed = job
     load, volts, event = happened(kind, seed)
     held = round(HELD_FROM_S * RATE)
@@ -163,7 +156,6 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
 
 
 def table(runs: Sequence[Run], hours: float, alarms: int, message: Sequence[str], cost: float) -> tuple[str, bool]:
-    """What came out, as text, and whether it is what is wanted."""
     lines, met = [], alarms == 0
     for kind in dict.fromkeys(r.kind for r in runs):
         of = [r for r in runs if r.kind == kind]
@@ -182,7 +174,6 @@ def table(runs: Sequence[Run], hours: float, alarms: int, message: Sequence[str]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the campaign; exit status 1 if what is wanted is not met."""
     parser = options(__doc__, jobs=1)
     parser.add_argument('--runs', type=int, default=100, help='events of each kind')
     parser.add_argument('--hours', type=float, default=24.0, help='quiet hours')

@@ -13,7 +13,7 @@ from typing import Any
 
 from selenium.webdriver.support.ui import WebDriverWait
 
-from tools.browser import open_browser, served
+from tools.browser import emulate, open_browser, served
 from tools.program import WAIT_S
 
 VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390, 844, True), ('dark', 390, 844, True))
@@ -53,13 +53,7 @@ def views(driver: Any) -> Iterator[str]:
     """Show the page in each of ``VIEWS``; yields its name. Afterwards the window is as it was."""
     try:
         for scheme, width, height, mobile in VIEWS:
-            driver.execute_cdp_cmd(
-                'Emulation.setDeviceMetricsOverride',
-                {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': mobile},
-            )
-            driver.execute_cdp_cmd(
-                'Emulation.setEmulatedMedia', {'features': [{'name': 'prefers-color-scheme', 'value': scheme}]}
-            )
+            emulate(driver, width, height, scheme=scheme, phone=mobile)
             yield f'{scheme}, {width} px'
     finally:
         driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})

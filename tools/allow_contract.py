@@ -19,7 +19,6 @@ class AllowContract(Contract):
     rooms = fields.ListField(subfield=fields.StringField())
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
-        """Compare what the modules import with the lines."""
         lines: dict[str, list[str]] = {}
         for line in _texts(self.rooms):
             room, _, libraries = line.partition(':')
@@ -28,7 +27,6 @@ class AllowContract(Contract):
         return ContractCheck(kept=not broken, metadata={'broken': broken})
 
     def render_broken_contract(self, check: ContractCheck) -> None:
-        """Print what breaks it, one a line."""
         for line in check.metadata['broken']:
             output.print_error(line)
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Headless Chromium with its driver, for the page's tests, pictures and timing."""
 
+import base64
 import contextlib
 import functools
 import http.server
@@ -9,23 +10,15 @@ import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
 FLAGS = (
-    '--headless',
-    '--no-sandbox',
-    '--disable-gpu',
-    '--disable-quic',
-    '--no-first-run',
-    '--disable-background-networking',
-    '--disable-component-update',
-    '--disable-sync',
-    # Draw the page although it is not visible.
-    '--disable-background-timer-throttling',
-    '--disable-renderer-backgrounding',
-    '--js-flags=--expose-gc',
+    *('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run'),
+    *('--disable-background-networking', '--disable-component-update', '--disable-sync'),
+    *('--disable-background-timer-throttling', '--disable-renderer-backgrounding', '--js-flags=--expose-gc'),
     '--enable-precise-memory-info',
 )
 WHAT_IS_NEEDED = 'Chromium and its driver are needed: apt install chromium chromium-driver'
@@ -50,6 +43,23 @@ def open_browser(profile: Path, *flags: str) -> webdriver.Chrome:
         options.add_argument(flag)
     options.set_capability('goog:loggingPrefs', {'browser': 'ALL'})
     return webdriver.Chrome(options=options, service=Service(driver))
+
+
+def emulate(
+    driver: Any, width: int, height: int, ratio: float = 1.0, scheme: str = 'light', phone: bool = False
+) -> None:
+    """Show the page on a screen of that size, in that colour scheme."""
+    screen = {'width': width, 'height': height, 'deviceScaleFactor': ratio, 'mobile': phone}
+    driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', screen)
+    colours = {'features': [{'name': 'prefers-color-scheme', 'value': scheme}]}
+    driver.execute_cdp_cmd('Emulation.setEmulatedMedia', colours)
+
+
+def picture(driver: Any, file: Path) -> None:
+    """What the page shows, without scroll bars, into ``file``."""
+    driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'")
+    shot = driver.execute_cdp_cmd('Page.captureScreenshot', {})
+    file.write_bytes(base64.b64decode(shot['data']))
 
 
 def heap_bytes(driver: webdriver.Chrome) -> int:

@@ -89,7 +89,6 @@ class Checked:
         self._first_ns = 0
 
     def put(self, record: Record) -> None:
-        """Take a record, as a sink does."""
         if not isinstance(record, SampleBlock):
             return
         self._first_ns = self._first_ns or int(record.t_ns[0])
@@ -102,7 +101,6 @@ class Checked:
 
 
 def main() -> int:
-    """Run the check; 0 if everything is correct."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('elf', type=Path)
     parser.add_argument('--seconds', type=float, default=20.0)

@@ -121,7 +121,6 @@ def check_picture(path: Path) -> None:
 
 
 def main() -> int:
-    """Check each recording; the picture is of the last one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recordings', metavar='REC', nargs='+', type=Path)
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='where the .rrd go')

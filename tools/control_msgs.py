@@ -17,40 +17,8 @@ from tools.program import ROOT
 
 PACKAGE = 'control_msgs'
 FOLDER = ROOT / 'build' / PACKAGE
-TOLERANCE = 'float64 position\nfloat64 velocity\nfloat64 acceleration\n'
-DEFINITIONS = {
-    'msg/JointTolerance.msg': f'string name\n{TOLERANCE}',
-    'msg/JointComponentTolerance.msg': 'uint16 X_AXIS=1\nuint16 Y_AXIS=2\nuint16 Z_AXIS=3\n'
-    f'uint16 TRANSLATION=4\nuint16 ROTATION=5\nstring joint_name\nuint16 component\n{TOLERANCE}',
-    'action/FollowJointTrajectory.action': """\
-trajectory_msgs/JointTrajectory trajectory
-trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory
-JointTolerance[] path_tolerance
-JointComponentTolerance[] component_path_tolerance
-JointTolerance[] goal_tolerance
-JointComponentTolerance[] component_goal_tolerance
-builtin_interfaces/Duration goal_time_tolerance
----
-int32 error_code
-int32 SUCCESSFUL = 0
-int32 INVALID_GOAL = -1
-int32 INVALID_JOINTS = -2
-int32 OLD_HEADER_TIMESTAMP = -3
-int32 PATH_TOLERANCE_VIOLATED = -4
-int32 GOAL_TOLERANCE_VIOLATED = -5
-string error_string
----
-std_msgs/Header header
-string[] joint_names
-trajectory_msgs/JointTrajectoryPoint desired
-trajectory_msgs/JointTrajectoryPoint actual
-trajectory_msgs/JointTrajectoryPoint error
-string[] multi_dof_joint_names
-trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_desired
-trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_actual
-trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_error
-""",
-}
+GIVEN = ROOT / 'tools' / 'control_msgs_interface'
+DEFINITIONS = sorted(file for file in GIVEN.rglob('*.*'))
 USED = (
     *('action_msgs', 'builtin_interfaces', 'geometry_msgs', 'service_msgs', 'std_msgs', 'trajectory_msgs'),
     *('type_description_interfaces', 'unique_identifier_msgs'),
@@ -86,8 +54,9 @@ def available() -> bool:
 
 def built() -> Path:
     """The folder in which the package lies, once it is whole. RuntimeError with what the compiler said."""
-    key = hashlib.sha256(Path(__file__).read_bytes() + sys.version.encode() + sys.prefix.encode()).hexdigest()[:16]
-    place = FOLDER / key
+    key = hashlib.sha256(b''.join(f.read_bytes() for f in (Path(__file__), *DEFINITIONS)))
+    key.update(f'{sys.version}{sys.prefix}'.encode())
+    place = FOLDER / key.hexdigest()[:16]
     FOLDER.mkdir(parents=True, exist_ok=True)
     with (FOLDER / 'lock').open('w') as lock:
         # The workers of pytest come at once.
@@ -115,13 +84,12 @@ def _generate(work: Path) -> None:
 
     os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
     given_in = work / PACKAGE
-    for name, text in DEFINITIONS.items():
-        file = given_in / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text, encoding='utf-8')
-        convert = convert_msg_to_idl if file.suffix == '.msg' else convert_action_to_idl
-        convert(given_in, PACKAGE, Path(name), file.parent)
-    given = [f'{given_in}:{Path(name).with_suffix(".idl")}' for name in DEFINITIONS]
+    shutil.copytree(GIVEN, given_in)
+    names = [file.relative_to(GIVEN) for file in DEFINITIONS]
+    for name in names:
+        convert = convert_msg_to_idl if name.suffix == '.msg' else convert_action_to_idl
+        convert(given_in, PACKAGE, name, (given_in / name).parent)
+    given = [f'{given_in}:{name.with_suffix(".idl")}' for name in names]
     shares = [Path(sys.prefix) / 'share' / package for package in USED]
     hashes = HashTypeDescription('').generate_type_hashes(PACKAGE, given, shares, given_in)
     makers = (

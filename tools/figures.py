@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy.signal import savgol_filter
 
 from blind import motion
+from blind.campaign import chunk
 from blind.generator import MM_PER_V, RATE
 from blind.watch import BLOCK, HELD_FROM_S, SIZES, Chain, happened
 from psd_deflection.measure.pipeline import Pipeline
@@ -30,7 +31,6 @@ def gain(orders: int, frequency: np.ndarray) -> np.ndarray:
 
 
 def block_fit(target: str) -> None:
-    """What a block gives of a motion."""
     frequency = np.linspace(0.0, 120.0, 600)
     figure, axes = plt.subplots(figsize=(7.0, 3.6), layout='constrained')
     for orders, label in ((1, 'mean'), (3, 'poly, orders 0 to 2'), (5, 'poly, orders 0 to 4')):
@@ -49,7 +49,6 @@ STEP, DARK, END = 3.095, (3.4, 3.6), 3.8  # s: when the load is switched, when l
 
 
 def switched(target: str) -> None:
-    """A switched load and a lost laser."""
     loads = np.zeros((int(END * RATE), 3))
     loads[int(STEP * RATE) :, 0] = 10.0
     run = motion.run_of(loads, 1)
@@ -59,8 +58,8 @@ def switched(target: str) -> None:
     pipeline = Pipeline(motion.rig_of())
     moved = [
         record
-        for block in range(len(loads) // motion.BLOCK)
-        for record in pipeline.process(motion.chunk(run, block))
+        for block in range(0, len(loads), motion.BLOCK)
+        for record in pipeline.process(chunk(run.volts[block : block + motion.BLOCK], block))
         if isinstance(record, TipMotion)
     ]
     t = np.arange(len(loads)) / RATE
@@ -89,7 +88,6 @@ CHANNELS = {'x1': 0, 'y1': 1, 'x2': 3, 'y2': 4}
 
 
 def events(target: str) -> None:
-    """Three events of the watch, and when they are seen."""
     figure = Figure(figsize=(10, 3.2), layout='constrained')
     axes = figure.subplots(1, len(SIZES))
     held = round(HELD_FROM_S * RATE)
@@ -121,7 +119,6 @@ FIGURES = {'block_fit': block_fit, 'motion': switched, 'watch': events}
 
 
 def main() -> int:
-    """Draw it."""
     name, *file = sys.argv[1:] or ['']
     if name not in FIGURES:
         print('NAME of', *FIGURES, file=sys.stderr)

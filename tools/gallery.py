@@ -121,7 +121,6 @@ def run(words: list[str]) -> str:
 
 
 def record(case: Case, folder: Path) -> Path:
-    """The recording of the case: simulated, then changed as the case says."""
     path = folder / f'{case.name}.csv'
     words = re.sub(r'\b[A-Z_]{4,}\b', lambda word: str(_TABLES['loads'][word[0]]), case.simulate)
     run(['simulate', '--out', str(path), *shlex.split(words)])
@@ -171,7 +170,6 @@ def reported_live(path: Path) -> str:
 
 
 def answered(case: Case, folder: Path) -> str:
-    """What the product says of the case."""
     path = record(case, folder)
     if case.study == 'live':
         return reported_live(path)
@@ -199,7 +197,6 @@ def without_repeats(lines: list[str]) -> list[str]:
 
 
 def picture(case: Case, folder: Path) -> bytes:
-    """The plot of its recording, small."""
     drawn = folder / f'{case.name}.png'
     run(['plot', str(folder / f'{case.name}.csv'), '--out', str(drawn)])
     image = Image.open(drawn).convert('RGB')
@@ -210,14 +207,12 @@ def picture(case: Case, folder: Path) -> bytes:
 
 
 def section(case: Case, message: str) -> str:
-    """The part of the page about one case."""
     quoted = '\n'.join(f'    {line}' for line in message.splitlines())
     parts = (f'### {case.title}', f'![Recording](figures/gallery/{case.name}.png)', quoted, case.do)
     return '\n\n'.join(filter(None, parts)) + '\n'
 
 
 def page(message: dict[str, str]) -> str:
-    """The whole page; ``message``: by the name of the case."""
     parts = [
         '# Gallery\n\nA good rig and typical faults: the recording, the first lines of the output (… marks a cut), and '
         'the remedy. `make docs STEP=gallery` makes this page; the tests compare it.\n'
@@ -230,7 +225,6 @@ def page(message: dict[str, str]) -> str:
 
 
 def kept() -> dict[str, str]:
-    """What the page has of each case, by its name."""
     if not PAGE.exists():
         return {}
     found = re.findall(r'figures/gallery/(\w+)\.png\)\n\n((?: {4}.*\n)+)', PAGE.read_text())
@@ -258,7 +252,6 @@ def _last_digit(found: re.Match[str]) -> float:
 
 
 def shown(case: Case, renew: bool) -> str:
-    """What the product says of the case; ``renew``: its picture is drawn too."""
     with tempfile.TemporaryDirectory() as temporary:
         message = answered(case, Path(temporary))
         if renew:

@@ -7,7 +7,6 @@ import ast
 import hashlib
 import os
 import random
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,9 +20,9 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
 from tools.mutants_by_hand import BY_HAND, HandMade, hand_made
+from tools.program import ROOT, copy_checkout
 from tools.tiers import ROOMS, Room
 
-ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
 NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
 """Broken files that a test has noticed, "DIGEST STAGE" a line: only what was not is tried again. Delete it to begin
@@ -63,7 +62,6 @@ class Mutant(NamedTuple):
 
 
 def in_room(file: str, room: Room) -> bool:
-    """Whether ``file`` belongs to what is broken in ``room``."""
     return any(file == c or file.startswith(c + '/') for c in room.code)
 
 
@@ -74,15 +72,6 @@ def of_room(room: Room) -> list[HandMade]:
         if not any(in_room(m.file, r) for r in ROOMS.values()):
             raise ValueError(f'{BY_HAND.name}: {m.file} is of no room')
     return [m for m in every if in_room(m.file, room)]
-
-
-def copy_of_checkout(folder: Path) -> Path:
-    """What git knows of this checkout, as it lies here."""
-    for name in subprocess.check_output(['git', 'ls-files', '-z'], cwd=ROOT, text=True).split('\0'):
-        if name and (ROOT / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, folder / name)
-    return folder
 
 
 def mutants_of(file: str, text: str) -> Iterator[Mutant]:
@@ -160,7 +149,7 @@ def tried(
     lines = NOTICED.read_text().splitlines() if NOTICED.exists() else []
     noticed = dict(line.split(' ') for line in lines)
     with tempfile.TemporaryDirectory() as scratch:
-        folder = copy_of_checkout(Path(scratch))
+        folder = copy_checkout(Path(scratch))
         left: list[Mutant | HandMade] = [*(of_room(room) if seed is None else drawn(folder, room, count, seed))]
         stages = [
             (stage, tests)

@@ -38,7 +38,6 @@ def commands() -> str:
 
 
 def exit_statuses() -> str:
-    """A row for each exit status."""
     return _table('status | meaning', (f'| {s} | {meaning} |' for s, meaning in errors.EXIT_STATUSES.items()))
 
 
@@ -57,7 +56,6 @@ def _named(p: Parameter, start: int) -> str:
 
 
 def effects() -> str:
-    """A row for each effect of the package, in the order in which they act."""
     shown = sorted((e for e in catalogue().values() if e.name in OWN_EFFECTS), key=lambda e: e.rank)
     return _table('effect | what it does | parameters', (_effect(e) for e in shown))
 
@@ -117,7 +115,6 @@ def written(page: str) -> str:
 
 
 def main(pages: Iterable[Path] = PAGES) -> None:
-    """Write the tables of ``pages`` into them."""
     for page in pages:
         page.write_text(written(page.read_text(encoding='utf-8')), encoding='utf-8')
     print(f'{words()} words in README and docs/, of at most {MOST_WORDS}')

@@ -3,14 +3,17 @@
 """Runs a program as a process and reads its output, for tests, campaigns and the check of documented commands."""
 
 import contextlib
+import fcntl
 import os
 import pty
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 WAIT_S = 240.0
@@ -18,6 +21,31 @@ WAIT_S = 240.0
 
 ROOT = Path(__file__).resolve().parent.parent
 PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')  # How our own program is started in this environment.
+
+
+def copy_checkout(target: Path, *words: str) -> Path:
+    """Copy the files that git tracks, or lists with ``words``, into ``target``, with their times; return it."""
+    listed = subprocess.run(['git', 'ls-files', '-z', *words], cwd=ROOT, check=True, capture_output=True, text=True)
+    for name in filter(None, listed.stdout.split('\0')):
+        if (ROOT / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target / name)
+    return target
+
+
+@contextlib.contextmanager
+def ros_domain() -> Iterator[int]:
+    """A ROS_DOMAIN_ID that nobody else has, held by a lock. RuntimeError if none is free."""
+    # Each domain takes ports of its own; those above 99 are in the range that systems use for others.
+    for candidate in range(99, 19, -1):
+        with (Path(tempfile.gettempdir()) / f'psd_deflection_test_domain_{candidate}').open('w') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield candidate
+            return
+    raise RuntimeError('no ROS domain is free')
 
 
 class Program:

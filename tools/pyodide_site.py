@@ -1,7 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Puts Python for the browser beside the page "Try it in the browser": ``make docs`` calls it with the site's
-folder."""
+"""Puts Python for the browser beside the page "Try it in the browser"; ``make docs`` calls it."""
 
 import argparse
 import base64

@@ -112,7 +112,6 @@ def citation_cff(root: Path) -> str:
 
 
 def setup_cfg(root: Path) -> str:
-    """setup.cfg with the addresses of package.xml."""
     f = facts(root)
     text = (root / 'setup.cfg').read_text()
     text = re.sub(r'(?m)^author_email = .*$', f'author_email = {f.email}', text)
@@ -318,7 +317,6 @@ NEVER_HERE = (
 
 
 def main(argv: list[str] | None = None, root: Path = ROOT) -> int:
-    """``files`` or ``check`` of the tree ``root``; exit status 1 for problems."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('what', choices=('files', 'check'))
     parser.add_argument('--dist', type=Path, default=root / 'dist')

@@ -107,7 +107,6 @@ def differences(table: dict[str, dict[str, str]], found: dict[str, dict[str, str
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit status 1 where the table or package.xml disagrees with rosdep."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('rosdistro', type=Path)
     parser.add_argument('--tools', type=Path, default=ROOT / 'build/bloom', help='environment with rosdep')

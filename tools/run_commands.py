@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs the commands of README and docs as a reader would: ``make docs STEP=commands``."""
 
-import contextlib
-import fcntl
 import json
 import os
 import re
@@ -20,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tools.program import PSD_DEFLECTION, ROOT, Program
+from tools.program import PSD_DEFLECTION, ROOT, Program, copy_checkout, ros_domain
 from tools.tasks import SHORTEST_BENCH, TASKS
 
 WAIT_S = 1200.0
@@ -71,8 +69,6 @@ ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')  # Commands
 
 
 class Command(NamedTuple):
-    """One command of the documents."""
-
     page: str
     block: int
     line: str
@@ -121,7 +117,6 @@ def filled(line: str, recording: str = 'bags/clean') -> str:
 
 
 def run_by_ci(line: str) -> tuple[str, str] | None:
-    """File, and the text in it that runs ``line``."""
     return next(((file, text) for pattern, file, text in CI_RUNS if re.search(pattern, line)), None)
 
 
@@ -190,7 +185,6 @@ def what_is_missing(line: str) -> str:
 
 
 def stale() -> list[str]:
-    """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
     patterns = [p for p, *_ in CI_RUNS]
     patterns += [
@@ -226,7 +220,6 @@ class Reader:
             self._background.clear()
 
     def type(self, line: str) -> None:
-        """Run one command; raises RuntimeError if it fails."""
         line = line.replace('/dev/ttyACM0', 'ttyACM0').replace('/dev/pts/3', self._served)
         if 'ttyACM0' in line and self._device is None:
             self._device = self._start('psd-deflection simulate --serve --link ttyACM0')
@@ -294,7 +287,6 @@ class Reader:
             raise RuntimeError(f'no recording was made\n{program.text[-2000:]}')
 
     def _serve(self) -> None:
-        """Start a daemon with a page, unless one runs."""
         if not self._background:
             self._background.append(self._start('psd-deflection monitor'))
             self._background[-1].until(r'θ +[-+]\d')
@@ -322,37 +314,6 @@ class Reader:
             self._device.end()
 
 
-@contextlib.contextmanager
-def a_domain_of_our_own() -> Iterator[str]:
-    """A ROS_DOMAIN_ID held by a lock, the one that the tests use."""
-    for candidate in range(99, 19, -1):
-        with (Path(tempfile.gettempdir()) / f'psd_deflection_test_domain_{candidate}').open('w') as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            yield str(candidate)
-            return
-    raise SystemExit('no ROS domain is free')
-
-
-def copy_checkout(target: Path) -> None:
-    """Copy the files that git tracks or would add, with their times, so that make rebuilds nothing."""
-    names = subprocess.run(
-        ['git', 'ls-files', '-z', '--cached', '--others', '--exclude-standard'],
-        cwd=ROOT,
-        capture_output=True,
-        check=True,
-    ).stdout.decode()
-    for name in names.split('\0'):
-        if name and (ROOT / name).is_file():
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, target / name)
-    full = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
-    (target / CUT).mkdir(parents=True)
-    (target / CUT / 'cut_0.mcap').write_bytes(full[: len(full) * 6 // 10])
-
-
 def main() -> int:
     """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed.
     ``--no-campaigns``: without those that have a short form."""
@@ -362,15 +323,18 @@ def main() -> int:
     only = ' '.join(word for word in sys.argv[1:] if word != NO_CAMPAIGNS)
     environment = Path(sys.prefix)
     failures = 0
-    with tempfile.TemporaryDirectory() as temporary, a_domain_of_our_own() as domain:
+    with tempfile.TemporaryDirectory() as temporary, ros_domain() as domain:
         folder = Path(temporary) / 'checkout'
-        copy_checkout(folder)
+        copy_checkout(folder, '--cached', '--others', '--exclude-standard')
+        full = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
+        (folder / CUT).mkdir(parents=True)
+        (folder / CUT / 'cut_0.mcap').write_bytes(full[: len(full) * 6 // 10])
         os.environ.update(
             PATH=f'{environment / "bin"}:{os.environ["PATH"]}',
             VIRTUAL_ENV=str(environment),
             VENV=str(environment),
             MAKEFLAGS=f'VENV={environment}',
-            ROS_DOMAIN_ID=domain,
+            ROS_DOMAIN_ID=str(domain),
             ROS_LOG_DIR=f'{temporary}/log',
             XDG_STATE_HOME=f'{temporary}/state',
         )

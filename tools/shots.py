@@ -3,70 +3,50 @@
 """Makes the pictures of the live page in docs/figures: ``make docs STEP=shots``; needs Chromium and its driver."""
 
 import argparse
-import base64
 import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from selenium.webdriver.support.ui import WebDriverWait
 
-from tools.browser import open_browser
+from tools.browser import emulate, open_browser, picture
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 FIGURES = Path(__file__).resolve().parents[1] / 'docs' / 'figures'
-MONITOR = ('monitor', 1440, 900, 1.0, 'light', False)
-LASER_OFF = ('monitor_laser_off', 1440, 900, 1.0, 'light', False)
-AWAY = ('monitor_away', 1440, 900, 1.0, 'light', False)
 THETA = 'return document.getElementById("theta").textContent'
 LOADED = r'\u22129[34]\d\.\d+'
 """The twist in mdeg when 50 N hang on the sidebar, which they do every ``LOAD_PERIOD_S``."""
 LOAD_PERIOD_S = 36.0
 BLOCKS_PER_S = 50.0
-PHONE = ('monitor_phone', 390, 844, 2.0, 'light', True)
+DESK, PHONE = (1440, 900), (390, 844, 2.0, 'light', True)
 
 
-def take(
-    url: str,
-    name: str,
-    width: int,
-    height: int,
-    ratio: float,
-    scheme: str,
-    mobile: bool,
-    seconds: float,
-    ready: Callable[[Any], bool] = lambda driver: True,
-) -> None:
-    """One picture, once ``seconds`` of data were drawn and the page is ``ready``."""
+def anything(driver: Any) -> bool:
+    return True
+
+
+def take(url: str, name: str, screen: Sequence[Any], seconds: float, ready: Callable[[Any], bool] = anything) -> None:
+    """One picture, on a screen of :func:`emulate`, once ``seconds`` of data were drawn and the page is ``ready``."""
     driver = open_browser(Path(tempfile.mkdtemp()))
     try:
-        driver.execute_cdp_cmd(
-            'Emulation.setDeviceMetricsOverride',
-            {'width': width, 'height': height, 'deviceScaleFactor': ratio, 'mobile': mobile},
-        )
-        driver.execute_cdp_cmd(
-            'Emulation.setEmulatedMedia', {'features': [{'name': 'prefers-color-scheme', 'value': scheme}]}
-        )
+        emulate(driver, *screen)
         driver.get(url)
-        driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'")
         wait = WebDriverWait(driver, seconds + LOAD_PERIOD_S + WAIT_S, poll_frequency=0.2)
         wait.until(drawn(seconds))
         wait.until(ready)
-        shot = driver.execute_cdp_cmd('Page.captureScreenshot', {})
-        (FIGURES / f'{name}.png').write_bytes(base64.b64decode(shot['data']))
+        picture(driver, FIGURES / f'{name}.png')
     finally:
         driver.quit()
 
 
 def loaded(driver: Any) -> bool:
-    """Whether 50 N hang on the sidebar."""
     return re.fullmatch(LOADED, driver.execute_script(THETA)) is not None
 
 
 def shows(*texts: str) -> Callable[[Any], bool]:
-    """Whether the page shows one of ``texts``."""
     return lambda driver: any(text in driver.execute_script('return document.body.innerText') for text in texts)
 
 
@@ -82,12 +62,10 @@ def away_without(device: Program) -> Callable[[Any], bool]:
 
 
 def drawn(seconds: float) -> Callable[[Any], bool]:
-    """Whether so many seconds of data were drawn."""
     return lambda driver: int(driver.execute_script('return document.body.dataset.rows ?? 0')) >= BLOCKS_PER_S * seconds
 
 
 def main() -> int:
-    """Start the rig, take all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
     args = parser.parse_args()
@@ -97,13 +75,14 @@ def main() -> int:
         program = Program([*monitor, '--demo'])
         try:
             url = program.until(r'monitor: (http\S+)')[1]
-            take(url, *MONITOR, seconds, loaded if seconds > 10.0 else lambda driver: True)
-            take(url, *PHONE, 4.0)
+            take(url, 'monitor', DESK, seconds, loaded if seconds > 10.0 else anything)
+            take(url, 'monitor_phone', PHONE, 4.0)
         finally:
             program.end()
         program = Program([*monitor, 'bags/laser_off', '--loop'], FIGURES.parents[1])
         try:
-            take(program.until(r'monitor: (http\S+)')[1], *LASER_OFF, 1.0, shows('laser 1 lost', 'laser 2 lost'))
+            url = program.until(r'monitor: (http\S+)')[1]
+            take(url, 'monitor_laser_off', DESK, 1.0, shows('laser 1 lost', 'laser 2 lost'))
         finally:
             program.end()
         port = f'{folder}/rig_port'
@@ -112,7 +91,7 @@ def main() -> int:
         program = Program([*monitor, '--port', port])
         try:
             url = program.until(r'monitor: (http\S+)')[1]
-            take(url, *AWAY, 3.0, away_without(device))
+            take(url, 'monitor_away', DESK, 3.0, away_without(device))
         finally:
             program.end()
             device.end()

@@ -79,7 +79,6 @@ def shell(line: str) -> int:
 
 
 def run(task: Task, words: list[str]) -> int:
-    """The exit status of a task, once what it needs is there."""
     wanted = [package for program, package in task.apt if shutil.which(program) is None]
     if wanted:
         get = f'{ROOT_WORD}apt-get -qq'

@@ -27,5 +27,4 @@ def paths_of(name: str) -> tuple[str, ...]:
 
 
 def holds(paths: tuple[str, ...], file: str) -> bool:
-    """Return whether ``file`` is one of these files or in one of these folders."""
     return any(file == path or file.startswith(f'{path}/') for path in paths)

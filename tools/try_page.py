@@ -3,7 +3,6 @@
 """Runs the page "Try it in the browser" of the site as a visitor does (``make docs STEP=try-page``); needs Chromium."""
 
 import argparse
-import base64
 import sys
 import tempfile
 from pathlib import Path
@@ -14,7 +13,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from tools.accessible import views, violations
-from tools.browser import open_browser, served
+from tools.browser import emulate, open_browser, picture, served
 
 LIMIT_S = 1200.0
 """Longest wait for an answer: a busy machine, both cores taken, computes many times as long as an idle one."""
@@ -33,7 +32,6 @@ def state(driver: Any) -> str:
 
 
 def text(driver: Any, name: str) -> str:
-    """What a part of the page shows."""
     return str(driver.find_element(By.ID, f'try-{name}').text)
 
 
@@ -57,23 +55,7 @@ def wrong(hidden: str, answer: str) -> bool:
     return not answer.startswith(f'{hidden.partition(",")[0]} ' if hidden != 'nothing' else NOTHING)
 
 
-def picture(driver: Any, file: Path) -> None:
-    """The page as it is, in light colours and without scroll bars, into ``file``."""
-    width, height = SIZE
-    driver.execute_cdp_cmd(
-        'Emulation.setDeviceMetricsOverride',
-        {'width': width, 'height': height, 'deviceScaleFactor': 1, 'mobile': False},
-    )
-    driver.execute_cdp_cmd(
-        'Emulation.setEmulatedMedia', {'features': [{'name': 'prefers-color-scheme', 'value': 'light'}]}
-    )
-    driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'; window.scrollTo(0, 0)")
-    shot = driver.execute_cdp_cmd('Page.captureScreenshot', {})
-    file.write_bytes(base64.b64decode(shot['data']))
-
-
 def main() -> int:
-    """The exit status is 1 if the page is wrong once."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument('site', type=Path)
     parser.add_argument('--picture', type=Path, metavar='FILE', help='the page after the first answer, as a .png')
@@ -96,6 +78,8 @@ def main() -> int:
                 if choice != HIDDEN[0]:
                     continue
                 if args.picture is not None:
+                    emulate(driver, *SIZE)
+                    driver.execute_script('window.scrollTo(0, 0)')
                     picture(driver, args.picture)
                 for view in views(driver):
                     for line in violations(driver):

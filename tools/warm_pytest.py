@@ -113,7 +113,6 @@ def warm_up(tests: Sequence[str]) -> None:
 
 
 def tested(tests: Sequence[str]) -> int:
-    """Run ``tests``; the exit code of pytest."""
     return int(pytest.main([*OPTIONS, *tests]))
 
 

@@ -165,10 +165,8 @@ def good_of(topic: str, kind: type) -> Good:
 
 
 class Attacked(ABC):
-    """A node in this process. ``hand``: gives it an encoded message as DDS does; set by whoever attacks. ``words``: of
-    its command, for the same as a process."""
+    """A node in this process. ``hand``: gives it an encoded message as DDS does; set by whoever attacks."""
 
-    words: ClassVar[tuple[str, ...]] = ()
     every: ClassVar[int] = 6  # So many strange messages come between what is right.
 
     def __init__(self, owner: BaseNode[Any]) -> None:
@@ -185,7 +183,6 @@ class Attacked(ABC):
         self.give()
 
     def rejected(self) -> int:
-        """Messages, as the node counts them."""
         return self.owner.gate.rejected.total()
 
     @abstractmethod
@@ -197,7 +194,6 @@ class Attacked(ABC):
         """What it did meanwhile."""
 
     def give(self, *topics: str) -> None:
-        """Hand over a good message of each."""
         for topic in topics:
             self.hand(topic, serialize_message(GOOD[topic]()))
 
@@ -218,7 +214,6 @@ class Measuring(Attacked):
                 raise session.failed or RuntimeError('a pipeline has ended')
 
     def rejected(self) -> int:
-        """By the sessions, or dropped on the way to them."""
         return sum(s.rejected.total() + s.processing.requests_dropped for s in self.sessions())
 
     def _estimates(self) -> int:
@@ -232,10 +227,6 @@ class Measuring(Attacked):
 
 
 class Estimator(Measuring):
-    """A simulated rig, with every input there is."""
-
-    words = ('--ros-args', '-p', 'filter:=modal', '-p', 'keep_zero:=false')
-
     def __init__(self, folder: Path) -> None:
         # What the watch holds is soon as much as it may be.
         watch = {'watch': 'on', 'watch_dir': str(folder), 'watch_minutes': 0.5, 'watch_memory': 2_000_000}
@@ -248,10 +239,6 @@ class Estimator(Measuring):
 
 
 class Chain(Measuring):
-    """Two simulated links."""
-
-    words = (str(CHAIN),)
-
     def __init__(self, folder: Path) -> None:
         self._node = ChainNode(str(CHAIN), {'bag_dir': str(folder)}, None, null_log, Signals())
         super().__init__(self._node)
@@ -260,7 +247,6 @@ class Chain(Measuring):
         return list(self._node.chain.sessions) if self._node.chain is not None else []
 
     def rejected(self) -> int:
-        """By the sessions and by the chain."""
         return super().rejected() + self.owner.gate.rejected.total()
 
 
@@ -281,7 +267,6 @@ class Camera(Attacked):
         self.give('/image')
 
     def faults(self) -> list[str]:
-        """What it sees must be answered."""
         return [] if self._answers else ['no image was answered']
 
     def summary(self) -> str:
@@ -302,18 +287,6 @@ def _listen(topic: str, heard: Callable[[Any], None]) -> None:
 
 class Compensator(Attacked):
     """Offsets that follow: silence and holds are what it may do, a step is not."""
-
-    words = (
-        '--urdf',
-        str(URDF),
-        '--tip',
-        'tool',
-        '--axes',
-        'x,z',
-        '--drive',
-        '--controller-state',
-        'std_msgs/msg/Bool',
-    )
 
     def __init__(self, folder: Path) -> None:
         # A busy machine is late, and what is right would be stale.
@@ -337,14 +310,12 @@ class Compensator(Attacked):
         _listen('/compensator/offsets', self._heard)
 
     def _heard(self, message: Any) -> None:
-        """Keep the last two, and the largest step."""
         self._rates = [*self._rates[-1:], self._node.settings.max_rate]
         self._stamps = [*self._stamps[-1:], time.monotonic()]
         self._commands = [*self._commands[-1:], np.array(message.data)]
         self.step = max(self.step, largest_step(self._stamps, self._commands, max(self._rates)))
 
     def runs(self) -> None:
-        """Raises what ended the thread that sends."""
         self._node.runs()
         self.states[self._node.command.state] += 1
 
@@ -365,20 +336,16 @@ class Compensator(Attacked):
             asked.send(None)
 
     def faults(self) -> list[str]:
-        """It must have followed, without a step."""
         out = [] if self.states[State.FOLLOWING] else ['the offsets never followed']
         return out + ([f'a step of {self.step:.4f} of max_rate * dt'] if self.step > MOST_STEP else [])
 
     def summary(self) -> str:
-        """How often it followed, and the largest step."""
         followed = self.states[State.FOLLOWING] / max(self.states.total(), 1)
         return f'the offsets followed {followed:.0%} of the time; largest step {self.step:.4f} of max_rate * dt'
 
 
 class Shaper(Attacked):
     """Trajectories that replace each other."""
-
-    words = ('--frequency', '12', '--urdf', 'robot_description')
 
     def __init__(self, folder: Path) -> None:
         self._shaped, self.step, self._turns = 0, 0.0, 0
@@ -425,12 +392,10 @@ class Shaper(Attacked):
         self.give('/shaper/trajectory')
 
     def faults(self) -> list[str]:
-        """It must have shaped, without a step."""
         out = self._wrong[:3] + ([] if self._shaped else ['no trajectory was shaped'])
         return out + ([f'a step of {self.step:.4f} of speed * {KINK_S:g} s'] if self.step > MOST_STEP else [])
 
     def summary(self) -> str:
-        """What was shaped, and the largest step."""
         return f'{self._shaped} trajectories shaped; largest step {self.step:.4f} of speed * {KINK_S:g} s'
 
 

@@ -1,7 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Kill -9 at random instants while recording: the file opens, lacks less than a second (``make campaign
-NAME=crash``)."""
+"""``make campaign NAME=crash``: kill -9 while recording, at any instant: the file opens, lacks less than a second."""
 
 import os
 import random
@@ -67,7 +66,6 @@ def evaluate(folder: Path, killed_ns: int) -> float:
 
 
 def main() -> int:
-    """Run the rounds; exit status 0 where each one lost less than a second."""
     parser = options(__doc__)
     parser.add_argument('--times', type=int, default=200)
     parser.add_argument('--seed', type=int, default=1)

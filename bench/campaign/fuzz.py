@@ -422,11 +422,9 @@ def everything(words: list[str]) -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument('--seconds', type=float, default=600.0, help='of each target and of the messages')
     parser.add_argument('--frames', type=int, default=10_000_000)
-    parser.add_argument('--hellos', type=int, default=1_000_000)
     options = parser.parse_args(words)
     runs = [
         ['fuzz', 'corrupted', str(options.frames)],
-        ['hellos', str(options.hellos)],
         ['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)],
         *(['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS),
     ]
@@ -438,7 +436,6 @@ def everything(words: list[str]) -> int:
 
 
 def main() -> int:
-    """Fuzz one target until its time is over, or a fault is found."""
     if sys.argv[1:2] == ['all']:
         return everything(sys.argv[2:])
     if len(sys.argv) > 2 and sys.argv[1] == 'corrupted':

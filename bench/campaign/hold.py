@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 
-from bench.campaign.controller_faults import CONTROLLER_FAULTS, controller_faults
 from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, LONGEST_S, MAX_RATE, Graph, faithful
 from bench.campaign.shaper_faults import action_faults, shaper_faults
 from blind.campaign import conclude, options
@@ -99,8 +98,6 @@ class Injected(NamedTuple):
 
 
 class Campaign(Graph):
-    """The graph with processes that stand for the estimator and the driver."""
-
     def __init__(self) -> None:
         super().__init__(*(topic for topic, _, _ in RELAYED.values()))
         self._robot_runs = self.node.create_publisher(Bool, '/compensator/robot_running', 5)
@@ -127,15 +124,15 @@ class Campaign(Graph):
 
     def _once(self, name: str) -> tuple[Injected, bool]:
         """What was found, and whether the campaign was late."""
-        self.spin(self.follows, LONGEST_S, f'offsets that follow before: {name}')
+        self.spin(LONGEST_S, self.follows, f'offsets that follow before: {name}')
         # They are to be far from zero.
-        self.spin(lambda: self.plant.error() < 1e-4, LONGEST_S, 'the rigid pose')
+        self.spin(LONGEST_S, lambda: self.plant.error() < 1e-4, 'the rigid pose')
         self.plant.late = False
         if name in OWN:
             return self._own(name), False
         began = time.time()
         end = self._begin(name)
-        self.spin(lambda: False, WATCHED_S)
+        self.spin(WATCHED_S)
         held = max(self._changed_last() - began, 0.0)
         if name == 'joints do not follow':
             held = max(self._changed_last() - self._beyond(began), 0.0)
@@ -144,7 +141,7 @@ class Campaign(Graph):
         late = self.plant.late
         end()
         self.enable()
-        self.spin(self.follows, LONGEST_S, f'offsets that follow after: {name}')
+        self.spin(LONGEST_S, self.follows, f'offsets that follow after: {name}')
         return out, late
 
     def _begin(self, name: str) -> Callable[[], None]:
@@ -190,10 +187,9 @@ class Campaign(Graph):
         self._robot_runs.publish(Bool(data=True))
 
     def _release(self, held: float) -> Injected:
-        """Let the offsets go while the fault is there."""
         asked, largest = time.time(), float(np.abs(self.plant.offsets[-1]).max())
         self.enable(False)
-        self.spin(lambda: not np.any(self.plant.offsets[-1]), LONGEST_S, 'no offset')
+        self.spin(LONGEST_S, lambda: not np.any(self.plant.offsets[-1]), 'no offset')
         return Injected(held, self.plant.stamps[-1] - asked, largest / MAX_RATE + RELEASE_S)
 
     def _own(self, name: str) -> Injected:
@@ -201,8 +197,8 @@ class Campaign(Graph):
         if name == 'an error of its own':
             largest = float(np.abs(plant.offsets[-1]).max())
             self.flag.touch()
-            self.spin(lambda: self.compensator.process.poll() is not None, LONGEST_S, 'its end')
-            self.spin(lambda: not np.any(plant.offsets[-1]), 1.0)
+            self.spin(LONGEST_S, lambda: self.compensator.process.poll() is not None, 'its end')
+            self.spin(1.0, lambda: not np.any(plant.offsets[-1]))
             failed = float(self.flag.read_text())
             self.flag.unlink()
             out = Injected(math.nan, plant.stamps[-1] - failed, largest / MAX_RATE + RELEASE_S)
@@ -213,7 +209,7 @@ class Campaign(Graph):
         self.start()
         self.until_ready()
         self.enable()
-        self.spin(self.follows, LONGEST_S, f'offsets that follow after: {name}')
+        self.spin(LONGEST_S, self.follows, f'offsets that follow after: {name}')
         return out
 
     def _changed_last(self) -> float:
@@ -231,6 +227,119 @@ class Campaign(Graph):
         for one in self.relays.values():
             one.close()
         super().close()
+
+
+HOLDS_S = 10.0  # The compensator must find a wrong sign or scale within this time of its enabling, s.
+WAY_OUT_S = 0.5
+"""Offsets must be back at zero so long after the time that ``MAX_RATE`` needs, s: the way out begins with a signal."""
+ENABLINGS = 5
+DROOP = 0.005  # rad
+CREEP = 1e-9  # How far a command may be from the first one after ``ENABLINGS`` enablings, rad.
+
+
+Outcome = tuple[bool, str]
+"""Whether the compensator did what it must, and with which figure."""
+
+
+def _hold(graph: Graph, share: float) -> Outcome:
+    """Enable against a controller that adds ``share`` of what it reports; the offsets must hold."""
+    plant = graph.plant
+    plant.share = share
+    graph.start()
+    graph.until_ready()
+    graph.enable()
+    graph.spin(HOLDS_S, lambda: 'of its offset' in graph.compensator.text)
+    held = 'of its offset' in graph.compensator.text
+    largest = float(np.abs(plant.held).max())
+    graph.enable(False)
+    graph.spin(LONGEST_S, lambda: not plant.held.any(), 'no offset')
+    return (held, f'largest offset {largest * 1e3:.2f} mrad')
+
+
+def _droop(graph: Graph) -> Outcome:
+    """Enable again and again where servos droop; no step, and afterwards the command of before."""
+    plant = graph.plant
+    plant.droop, plant.commands = DROOP, True
+    graph.start('--output', 'commands')
+    graph.until_ready()
+    for _ in range(ENABLINGS):
+        count = len(plant.offsets)
+        graph.enable()
+        graph.spin(LONGEST_S, lambda n=count: len(plant.offsets) > n + 30, 'commands')  # type: ignore[misc]
+        graph.enable(False)
+        graph.spin(WAY_OUT_S + LONGEST_S / 10.0, lambda: float(np.abs(plant.held).max()) < CREEP)
+    crept = float(np.abs(plant.held).max())
+    return (crept < CREEP, f'crept {crept * 1e3:.3g} mrad')
+
+
+def _followed(graph: Graph, breaks: str = 'health') -> float:
+    """Start and enable; return the largest offset, rad, as soon as it compensates the load."""
+    graph.start(breaks=breaks)
+    graph.until_ready()
+    graph.enable()
+    graph.spin(LONGEST_S, lambda: graph.plant.error() < 1e-4, 'the rigid pose')
+    return float(np.abs(graph.plant.held).max())
+
+
+def _way_out(graph: Graph) -> Outcome:
+    """Ctrl-C while what the way out needs fails; the offsets must go back all the same."""
+    largest = _followed(graph, 'take_in')
+    graph.flag.touch()
+    began = time.time()
+    graph.compensator.send(signal.SIGINT)
+    graph.spin(LONGEST_S, lambda: graph.compensator.process.poll() is not None, 'its end')
+    graph.spin(1.0, lambda: not graph.plant.held.any())
+    graph.flag.unlink()
+    took, allowed = graph.plant.stamps[-1] - began, largest / MAX_RATE + WAY_OUT_S
+    right = not graph.plant.held.any() and took <= allowed
+    return (right, f'released in {took * 1e3:.0f} ms of {allowed * 1e3:.0f} ms')
+
+
+def _restarted(graph: Graph) -> Outcome:
+    """Kill it and start it again: it must report the offsets that the controller has, and take them back on request."""
+    _followed(graph)
+    graph.compensator.send(signal.SIGKILL)
+    graph.compensator.wait()
+    graph.start()
+    graph.until_ready()
+    graph.spin(HOLDS_S, lambda: 'the controller applies' in graph.compensator.text)
+    reported, held = 'the controller applies' in graph.compensator.text, graph.plant.held.any()
+    graph.enable(False)
+    graph.spin(LONGEST_S / 10.0, lambda: not graph.plant.held.any())
+    taken_back = not graph.plant.held.any()
+    words = ('' if reported else 'not reported ') + ('' if taken_back else 'not taken back')
+    return (bool(reported and held and taken_back), words or 'reported and taken back')
+
+
+CONTROLLER_FAULTS: Mapping[str, Callable[[Graph], Outcome]] = {
+    'controller of wrong sign': lambda graph: _hold(graph, -1.0),
+    'controller of double scale': lambda graph: _hold(graph, 2.0),
+    'servos that droop': _droop,
+    'an error in the way out': _way_out,
+    'restart with offsets held': _restarted,
+}
+
+
+def controller_faults(name: str, times: int) -> tuple[int, float]:
+    """Inject one fault so often and print a line; return how often it went wrong, and the largest step."""
+    graph = Graph()
+    wrong, worst, texts = 0, 0.0, []
+    try:
+        for _ in range(times):
+            graph.compensator.end()
+            plant = graph.plant
+            plant.share, plant.droop, plant.commands, plant.held = 1.0, 0.0, False, np.zeros(2)
+            plant.arm.force = np.array(LOAD)
+            first = len(plant.offsets)
+            right, text = CONTROLLER_FAULTS[name](graph)
+            wrong += not right
+            texts.append(text)
+            worst = max(worst, plant.step(first))
+    finally:
+        graph.close()
+    step = f'largest step {worst:.3f} of max_rate * dt'
+    print(f'{name:26}{times:4} times: wrong {wrong}; last: {texts[-1]}; {step}', flush=True)
+    return wrong, worst
 
 
 def main(argv: list[str] | None = None) -> int:

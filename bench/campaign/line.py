@@ -87,7 +87,6 @@ class Line:
     # ---- what faults do
 
     def plug(self, name: str = 'port') -> None:
-        """Put the cable in, under ``name``."""
         with self.lock:
             self.greeted.clear()
             self._listening = False
@@ -123,7 +122,6 @@ class Line:
         return sure
 
     def _unread(self) -> int:
-        """Bytes that wait for the host to read them."""
         if self._terminal is None:
             return 0
         descriptor = os.open(self._terminal.name, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
@@ -135,7 +133,6 @@ class Line:
 
     @property
     def device_name(self) -> str:
-        """The host's side of the cable."""
         return self._terminal.name if self._terminal is not None else ''
 
     def restart(self, seq: int = 0, clock_us: int = 0) -> None:
@@ -143,7 +140,6 @@ class Line:
             self._seq, self._clock_us = seq, clock_us
 
     def jump(self, samples: int = 0, clock_us: int = 0) -> None:
-        """Numbers or clock jump ahead (or back)."""
         with self.lock:
             self._seq += samples
             self._clock_us += clock_us
@@ -152,13 +148,7 @@ class Line:
         with self.lock:
             self._pending += garbage
 
-    def backlog(self) -> int:
-        """Bytes that have not left the device yet."""
-        with self.lock:
-            return len(self._pending)
-
     def next_identity(self) -> int:
-        """Of the next sample to be taken."""
         with self.lock:
             return self.sent
 

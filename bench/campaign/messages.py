@@ -3,7 +3,6 @@
 """Messages of any content against every input of the five nodes: no end, no leak, and no step of what moves an arm."""
 
 import argparse
-import contextlib
 import os
 import random
 import resource
@@ -20,22 +19,19 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool
 
 from bench.campaign.attacked import NODES, Attacked, good_of
 from bench.campaign.strange import Stranger
-from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
+from blind.campaign import options
+from tools.program import ROOT
 
 MOST_GROWTH = 30e6  # Bytes that the process may grow by after the first tenth.
 SPIN_EVERY = 50  # Messages after which the node's timers have their turn.
 ASK_EVERY = 500  # Messages after which a service is asked.
 AS_GIVEN_AFTER = 200  # Messages after which the parameters that a request has set are set back.
 ANSWER_S = 30.0  # Longest time for the answer of a service, s.
-PAUSE_S = 0.002  # Between two messages over DDS, s.
-ON_GRAPH = ('/parameter_events', '/rosout')  # What ROS itself may subscribe to.
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # Whoever asks for less is served, too.
 SET_TYPES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 77)  # Types of a parameter, and one that is none.
 
 
@@ -43,23 +39,10 @@ class EndedError(Exception):
     """Something that came in has ended a node."""
 
 
-def memory(process: int | str = 'self') -> int:
-    """Bytes that a process has now."""
-    pages = int(Path(f'/proc/{process}/statm').read_text().split()[1])
+def memory() -> int:
+    """Bytes that this process has now."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
     return pages * resource.getpagesize()
-
-
-class Budget:
-    """Goes on for ``count`` messages, or for ``minutes`` if there are any."""
-
-    def __init__(self, count: int, minutes: float) -> None:
-        self._count, self._seconds, self._begun = count, 60.0 * minutes, time.monotonic()
-
-    def share(self, number: int) -> float:
-        """What of it is over, 0 to 1, after so many messages."""
-        if self._seconds:
-            return (time.monotonic() - self._begun) / self._seconds
-        return number / max(self._count, 1)
 
 
 class Inside:
@@ -80,14 +63,12 @@ class Inside:
         self.sent: Counter[str] = Counter()
 
     def inputs(self) -> dict[str, list[Any]]:
-        """What the node subscribes to now."""
         out: dict[str, list[Any]] = {}
         for one in self._node.subscriptions:
             out.setdefault(one.topic_name, []).append(one)
         return out
 
     def hand(self, topic: str, content: bytes) -> None:
-        """A message, as DDS hands it over."""
         for one in self.inputs().get(topic, ()):
             if one.raw:
                 message = content
@@ -115,7 +96,6 @@ class Inside:
         self.hand(topic, content)
 
     def _ask(self) -> None:
-        """One of its services, with any request."""
         service = self._chance.choice(list(self._node.services))
         self.asked += 1
         request = service.srv_type.Request()
@@ -136,7 +116,6 @@ class Inside:
         self._answer(service, request)
 
     def _set_back(self) -> None:
-        """Its parameters are again what they were."""
         changed = [p for name, p in self._as_given.items() if self._node.get_parameter(name).value != p.value]
         if changed:
             self._node.set_parameters(changed)
@@ -173,10 +152,10 @@ class Inside:
         except BaseException as error:
             raise EndedError(f'beside the messages: {type(error).__name__}: {error}') from error
 
-    def run(self, budget: Budget) -> int:
-        """Strange messages as long as the budget lasts; the bytes by which the process grew after the first tenth."""
-        begun, reported, inputs = 0, 0.0, self.inputs()
-        while (share := budget.share(self.number)) < 1.0:
+    def run(self, seconds: float) -> int:
+        """Strange messages for so long; the bytes by which the process grew after the first tenth."""
+        begun, reported, inputs, start = 0, 0.0, self.inputs(), time.monotonic()
+        while (share := (time.monotonic() - start) / seconds) < 1.0:
             if self.number % SPIN_EVERY == 0:
                 self.spin()
                 inputs = self.inputs()
@@ -208,85 +187,18 @@ class Inside:
         rclpy.try_shutdown()
 
 
-def over_dds(name: str, count: int, seed: int, folder: Path) -> list[str]:
-    """Send ``count`` messages to the process of a node, on every input that it has on the graph; what was wrong."""
-    command = [*PSD_DEFLECTION, name, *NODES[name].words, '--ros-args', '-r', f'__ns:=/{name}']
-    program = Program(command, cwd=folder)
-    rclpy.init(args=['stranger'])
-    node = rclpy.create_node('stranger')
-    stranger, chance = Stranger(seed), random.Random(seed)
-    try:
-        kinds = _on_graph(node, name, program)
-        senders = {
-            topic: (node.create_publisher(kind, topic, LATCHED), good_of(topic, kind)) for topic, kind in kinds.items()
-        }
-        for topic in senders:
-            _until(lambda topic=topic: senders[topic][0].get_subscription_count() > 0, topic, program)
-        before = 0
-        for number in range(count):
-            sender, good = senders[chance.choice(list(senders))]
-            # DDS itself does not send what is too short.
-            with contextlib.suppress(RuntimeError):
-                sender.publish(stranger.encode(stranger.change(good()))[0])
-            time.sleep(PAUSE_S)
-            if number == count // 10:
-                before = memory(program.process.pid)
-            if program.process.poll() is not None:
-                break
-        grown = memory(program.process.pid) - before if program.process.poll() is None else 0
-    finally:
-        status = program.end()
-        node.destroy_node()
-        rclpy.try_shutdown()
-    print(f'{name}: after {count} messages over DDS on {len(senders)} inputs {grown / 1e6:+.1f} MB, status {status}')
-    out = [f'over DDS it grew by {grown / 1e6:.1f} MB'] if grown > MOST_GROWTH else []
-    return out + ([f'over DDS it ended with status {status}: {program.text[-2000:]}'] if status else [])
-
-
-def _until(condition: Any, what: str, program: Program) -> None:
-    until = time.monotonic() + WAIT_S
-    while not condition():
-        if time.monotonic() > until or program.process.poll() is not None:
-            raise EndedError(f'{what}: is not on the graph\n{program.text[-2000:]}')
-        time.sleep(0.05)
-
-
-def _on_graph(node: Any, name: str, program: Program) -> dict[str, Any]:
-    """The inputs of the node ``name`` and their classes."""
-    from psd_deflection.ros.endpoints import message_class
-
-    found: dict[str, Any] = {}
-
-    def look() -> bool:
-        with contextlib.suppress(Exception):
-            heard = node.get_subscriber_names_and_types_by_node(name, f'/{name}')
-            found.update({topic: message_class(kinds[0]) for topic, kinds in heard if topic not in ON_GRAPH})
-        return bool(found)
-
-    _until(look, name, program)
-    # The rest of them comes within the time in which DDS finds all of a participant.
-    time.sleep(2.0)
-    look()
-    return found
-
-
 def attack(name: str, args: argparse.Namespace) -> int:
-    """Attack one node; 0 if it held."""
     with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
         os.environ.update({'ROS_LOG_DIR': place, 'XDG_STATE_HOME': place})
-        faults = over_dds(name, args.dds, args.seed, folder) if args.dds else []
-        inside = Inside(name, args.seed, folder)
-        began = time.monotonic()
+        inside = Inside(name, args.seed, Path(place))
         try:
-            grown = inside.run(Budget(args.count, args.minutes))
-            faults += inside.attacked.faults()
+            grown = inside.run(60.0 * args.minutes)
+            faults = inside.attacked.faults()
             if grown > MOST_GROWTH:
                 faults.append(f'it grew by {grown / 1e6:.1f} MB')
             if inside.attacked.rejected() < inside.undecodable:
                 faults.append(f'of {inside.undecodable} that cannot be decoded it counts {inside.attacked.rejected()}')
-            took = time.monotonic() - began
-            print(f'{name}: in {took:.0f} s {inside.reported()}; {grown / 1e6:+.1f} MB after the first tenth')
+            print(f'{name}: {inside.reported()}; {grown / 1e6:+.1f} MB after the first tenth')
             for topic, count in sorted(inside.sent.items()):
                 print(f'{name}:   {topic} {count}')
         finally:
@@ -297,17 +209,14 @@ def attack(name: str, args: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    """Exit status 0 if every node held."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('count', type=int, nargs='?', default=1_000_000)
-    parser.add_argument('--minutes', type=float, default=0.0, help='so long instead of COUNT messages')
+    parser = options(__doc__)
+    parser.add_argument('--minutes', type=float, default=10.0, help='for each node')
     parser.add_argument('--node', choices=[*NODES, 'all'], default='all')
-    parser.add_argument('--dds', type=int, default=2000, help='how many go over DDS before')
     parser.add_argument('--seed', type=int, default=1)
     args = parser.parse_args()
     if args.node != 'all':
         return attack(args.node, args)
-    same = [str(args.count), f'--minutes={args.minutes}', f'--dds={args.dds}', f'--seed={args.seed}']
+    same = [f'--minutes={args.minutes}', f'--seed={args.seed}']
     command = [sys.executable, '-m', 'bench.campaign.messages', *same]
     each = [subprocess.Popen([*command, '--node', name], cwd=ROOT) for name in NODES]
     return max(abs(one.wait()) for one in each)

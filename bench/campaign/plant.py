@@ -20,6 +20,7 @@ from std_srvs.srv import SetBool
 
 from bench.simulated_arm import SimulatedArm, largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.records import FloatArray
 from tools.program import ROOT, Program
@@ -36,7 +37,6 @@ Notify = Callable[[Any], bool]
 
 
 def faithful(message: Any) -> bool:
-    """What is right."""
     return True
 
 
@@ -71,7 +71,6 @@ def by_seconds(seconds: float) -> Notify:
 
 
 def leaps(message: Any) -> bool:
-    """Joints that are a radian away."""
     message.position = [v + 1.0 for v in message.position]
     return True
 
@@ -97,6 +96,46 @@ JOINTS: dict[str, tuple[Notify, str]] = {
     'leaping joints': (leaps, 'leap by'),
     'joints at 1e300': (wrong('position', [1e300, 1e300]), 'no positions of the joints'),
 }
+
+
+class Spun:
+    """A node of a campaign, which is spun here. ``program``: what it waits for, whose last words an error has."""
+
+    def __init__(self, name: str) -> None:
+        rclpy.init()
+        self.node = rclpy.create_node(name)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.program: Program | None = None
+
+    def spin(self, seconds: float, condition: Callable[[], bool] = lambda: False, what: str = '') -> bool:
+        """Spin until ``condition``, or for ``seconds``; then it is an error if there is a ``what``. Whether it came."""
+        until = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > until:
+                if what:
+                    said = self.program.text[-1000:] if self.program is not None else ''
+                    raise RuntimeError(f'waited {seconds:g} s for {what}\n{said}')
+                return False
+            self.executor.spin_once(timeout_sec=0.01)
+        return True
+
+    def close(self) -> None:
+        if self.program is not None:
+            self.program.end()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def message_of(deflection: Transform, chance: np.random.Generator) -> Any:
+    """What the chain publishes of a deflection of its end effector, without a stamp: with noise, and how much."""
+    out = PoseWithCovarianceStamped()
+    place, rotated = out.pose.pose.position, out.pose.pose.orientation
+    place.x, place.y, place.z = (deflection.position + chance.normal(size=3) * NOISE).tolist()
+    rotated.x, rotated.y, rotated.z, rotated.w = deflection.quaternion.tolist()
+    out.pose.covariance = (np.eye(6) * NOISE**2).ravel()
+    return out
 
 
 class Plant:
@@ -154,14 +193,9 @@ class Plant:
             self._reference.publish(JointState(name=['elbow', 'shoulder'], position=has))
         stamp_s, stamp_ns = divmod(time.time_ns(), 10**9)
         joints = JointState(name=['elbow', 'shoulder'], position=self.arm.angles[::-1].tolist())
-        deflection = self.arm.end().deflection
-        message = PoseWithCovarianceStamped()
+        message = message_of(self.arm.end().deflection, self._noise)
         for header in (joints.header, message.header):
             header.stamp.sec, header.stamp.nanosec = stamp_s, stamp_ns
-        place, rotated = message.pose.pose.position, message.pose.pose.orientation
-        place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
-        rotated.x, rotated.y, rotated.z, rotated.w = deflection.quaternion.tolist()
-        message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
         if self.notify_joints(joints):
             self._joints.publish(joints)
         if self.notify(message):
@@ -202,42 +236,29 @@ sys.exit(main(sys.argv[3:]))
 an error, or ``take_in``, which its way out needs as well."""
 
 
-class Graph:
+class Graph(Spun):
     """A node of the campaign, the arm, and the compensator, which ``start`` starts. ``topics``: the arm's outputs."""
 
     def __init__(self, *topics: str) -> None:
-        rclpy.init()
-        self.node = rclpy.create_node('campaign')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
+        super().__init__('campaign')
         self.plant = Plant(self.node, *topics)
         self.flag = Path(tempfile.mkdtemp()) / 'flag'
-        self.compensator = self.start()
+        self.start()
 
     def start(self, *arguments: str, breaks: str = 'health') -> Program:
         """Start the compensator with further arguments; ``breaks``: what fails once ``flag`` exists."""
         base = ['compensator', '--urdf', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive']
-        self.compensator = Program([sys.executable, '-c', BREAKS, str(self.flag), breaks, *base, *arguments])
+        self.compensator = self.program = Program(
+            [sys.executable, '-c', BREAKS, str(self.flag), breaks, *base, *arguments]
+        )
         return self.compensator
 
-    def spin(self, condition: Callable[[], bool], longest_s: float, what: str = '') -> None:
-        """Spin until ``condition``, or for ``longest_s``; then it is an error if there is a ``what``."""
-        until = time.monotonic() + longest_s
-        while not condition():
-            if time.monotonic() > until:
-                if what:
-                    raise RuntimeError(f'waited {longest_s:g} s for {what}\n{self.compensator.text[-1000:]}')
-                return
-            self.executor.spin_once(timeout_sec=0.02)
-
     def until_ready(self) -> None:
-        """Spin until the compensator can be enabled."""
-        self.spin(lambda: READY in self.compensator.text, LONGEST_S, 'the node')
+        self.spin(LONGEST_S, lambda: READY in self.compensator.text, 'the node')
 
     def enable(self, wanted: bool = True) -> None:
-        """Let the offsets follow, or let them go."""
         client = self.node.create_client(SetBool, '/compensator/enable')
-        self.spin(client.service_is_ready, LONGEST_S, 'the service')
+        self.spin(LONGEST_S, client.service_is_ready, 'the service')
         requests: list[Any] = []
 
         def answered() -> bool:
@@ -247,11 +268,5 @@ class Graph:
             return any(request.done() for request in requests)
 
         began = time.monotonic()
-        self.spin(answered, LONGEST_S, 'its answer')
+        self.spin(LONGEST_S, answered, 'its answer')
         self.node.destroy_client(client)
-
-    def close(self) -> None:
-        self.compensator.end()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown()

@@ -10,13 +10,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import rclpy
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from bench.campaign.plant import Spun
 from bench.campaign.strange import Stranger
 from bench.simulated_arm import largest_step_in_time
 from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving
@@ -36,7 +35,6 @@ Change = Callable[[Any], object]
 
 
 def _last(**fields: Any) -> Change:
-    """Of the last point."""
 
     def change(message: Any) -> None:
         for name, value in fields.items():
@@ -62,16 +60,13 @@ REJECTED: dict[str, Change] = {
 OTHERS = ('replaced again and again', 'joints not told', 'killed and started again', 'stopped for 0.2 s')
 
 
-class Moved:
+class Moved(Spun):
     """The graph: the shaper, and what it moves. ``stamps`` (s) and ``commands`` of the joints; ``late``: the numbers of
     those before which a trajectory came after its begin. ``heard``: how many came. ``reports``: whether the joints are
     told."""
 
     def __init__(self) -> None:
-        rclpy.init()
-        self.node = rclpy.create_node('moved')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
+        super().__init__('moved')
         self.controller = TrajectoryController(np.zeros(2))
         self.reports = True
         self.heard = 0
@@ -83,13 +78,13 @@ class Moved:
         self.given = self.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
         self.node.create_subscription(JointTrajectory, '/shaper/shaped', self._arrived, 5)
         self.node.create_timer(STEP_S, self._step)
-        self.shaper = self.started()
+        self.start()
 
-    def started(self) -> Program:
-        """The shaper, when it is known on the graph."""
-        out = Program([*PSD_DEFLECTION, 'shaper', '--frequency', '12', '--shaper', 'zvd'])
-        out.until('publishing /shaper/shaped')
-        return out
+    def start(self, *words: str) -> None:
+        """The shaper, until it is known on the graph."""
+        command = [*PSD_DEFLECTION, 'shaper', '--frequency', '12', '--shaper', 'zvd', *words]
+        self.shaper = self.program = Program(command)
+        self.shaper.until('publishing /shaper/shaped')
 
     def _arrived(self, message: Any) -> None:
         self.heard += 1
@@ -107,16 +102,6 @@ class Moved:
         if self.reports and len(self.stamps) % 5 == 0:
             self._joints.publish(JointState(name=list(NAMES), position=self.commands[-1].tolist()))
 
-    def spin(self, seconds: float, condition: Callable[[], bool] = lambda: False, what: str = '') -> None:
-        """Spin until ``condition``, or for ``seconds``; then it is an error if there is a ``what``."""
-        until = time.monotonic() + seconds
-        while not condition():
-            if time.monotonic() > until:
-                if what:
-                    raise RuntimeError(f'waited {seconds:g} s for {what}\n{self.shaper.text[-1000:]}')
-                return
-            self.executor.spin_once(timeout_sec=STEP_S)
-
     def move(self, change: Change = lambda message: None) -> None:
         """Give a trajectory to somewhere else, changed."""
         end = self._rng.uniform(-LARGEST, LARGEST, 2).tolist()
@@ -127,11 +112,9 @@ class Moved:
         self.give(message)
 
     def give(self, message: Any) -> None:
-        """Send a trajectory to the shaper."""
         self.given.publish(message)
 
     def under_way(self) -> None:
-        """Give trajectories until one is under way."""
         heard = self.heard
         until = time.monotonic() + LONGEST_S
         while self.heard == heard and time.monotonic() < until:
@@ -140,7 +123,6 @@ class Moved:
         self.spin(0.3)
 
     def inject(self, name: str) -> None:
-        """One fault while a trajectory is under way."""
         self.under_way()
         heard = self.heard
         if name in REJECTED:
@@ -164,7 +146,7 @@ class Moved:
             self.shaper.process.kill()
             self.shaper.wait()
             # The joints still move: it must begin when they stand.
-            self.shaper = self.started()
+            self.start()
         else:
             self.shaper.process.send_signal(signal.SIGSTOP)
             self.move()
@@ -172,12 +154,6 @@ class Moved:
             self.shaper.process.send_signal(signal.SIGCONT)
         self.under_way()
         self.spin(1.5)
-
-    def close(self) -> None:
-        self.shaper.end()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown()
 
 
 def injected(moved: Moved, names: Sequence[str], times: int, by: str = 'shaper') -> float:
@@ -211,8 +187,6 @@ MOST_S = 30.0  # Longest time until a goal ends that nobody follows any more, s.
 
 
 class Followed(Moved):
-    """The graph, with goals in place of messages."""
-
     def __init__(self) -> None:
         from control_msgs.action import FollowJointTrajectory
 
@@ -224,11 +198,8 @@ class Followed(Moved):
         self._client = ActionClient(self.node, FollowJointTrajectory, '/shaper/follow_joint_trajectory')
         self._served = ServedController(self.node, NAMES, self.controller)
 
-    def started(self) -> Program:
-        words = ['--frequency', '12', '--shaper', 'zvd', '--action', ACTION]
-        out = Program([*PSD_DEFLECTION, 'shaper', *words])
-        out.until('publishing /shaper/shaped')
-        return out
+    def start(self, *words: str) -> None:
+        super().start('--action', ACTION)
 
     def _step(self) -> None:
         if self._served is not None:
@@ -244,7 +215,6 @@ class Followed(Moved):
         self._sent.append(self._client.send_goal_async(self._goal(trajectory=message)))
 
     def _ended(self) -> None:
-        """Every goal that was sent has ended."""
         deaf = time.monotonic() + MOST_S
         for sent in self._sent[-5:]:
             self.spin(LONGEST_S, sent.done, 'an answer to a goal')
@@ -259,7 +229,6 @@ class Followed(Moved):
         self._stranger.change(message, 0.3)
 
     def inject(self, name: str) -> None:
-        """One fault while a goal is under way."""
         assert self._served is not None
         if name in REJECTED:
             super().inject(name)

@@ -5,7 +5,6 @@
 import contextlib
 import math
 import os
-import random
 import sys
 import tempfile
 import threading
@@ -17,8 +16,10 @@ import numpy as np
 from bench.campaign.line import hello_of
 from blind.campaign import options
 from psd_deflection.base.log import texts
+from psd_deflection.devices.contract_frames import PowerUp, SimulatedFrames
 from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
+from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.config import load_rig
@@ -36,7 +37,6 @@ PAGE = os.sysconf('SC_PAGE_SIZE')
 
 
 def resident(pid: int) -> int:
-    """Resident memory of a process, bytes."""
     return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * PAGE
 
 
@@ -45,9 +45,9 @@ class PolledDevice:
 
     def __init__(self, folder: Path) -> None:
         self.port = PseudoTerminal(folder / 'port')
+        feed = RigFeed(load_rig(), lambda _, n: np.zeros((n, 3)))
+        self._device = SimulatedFrames(feed, PowerUp(1e6 * SKEW, 0), serial='SOAK')
         self.start_ns = time.monotonic_ns()
-        self.taken = 0
-        self.listening_from = -1
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -57,32 +57,18 @@ class PolledDevice:
         return self.start_ns + round(number * MS / (1.0 + SKEW))
 
     def _run(self) -> None:
-        decoder, pending, chance = protocol.FrameDecoder(), b'', random.Random(2)
-        decoder.feed(b'\x00')
+        pending, heard = b'', False
         while not self._stop.is_set():
             now = time.monotonic_ns()
             time.sleep((MS - now % MS) / 1e9)
             now = time.monotonic_ns()
-            try:
-                for frame in decoder.feed(os.read(self.port.master, 4096)):
-                    if isinstance(frame, protocol.HelloRequestFrame):
-                        pending += protocol.encode(hello_of('SOAK'))
-                        self.listening_from = self.taken
-                    elif isinstance(frame, protocol.PingFrame):
-                        device_us = int((now - self.start_ns) * (1.0 + SKEW) / 1000)
-                        pending += protocol.encode(protocol.PongFrame(frame.cookie, device_us))
-            except (BlockingIOError, OSError):
-                pass
-            while self.true_ns(self.taken) < now - now % MS:
-                shake = chance.randrange(-6, 7)
-                counts = (shake, -shake, 16384, shake, shake, 16384 - shake)
-                pending += protocol.encode(protocol.SampleFrame(0, self.taken % 2**32, self.taken * 1000, counts))
-                self.taken += 1
-                if self.taken % 1000 == 0:
-                    pending += protocol.encode(hello_of('SOAK')) + protocol.encode(protocol.StatusFrame(0, 2150))
-            if self.listening_from < 0:
-                pending = b''
-                continue
+            # However late this thread is, the device drops nothing.
+            asked, stream = b'', self._device.take(now - now % MS - self.start_ns, 1 << 20)
+            with contextlib.suppress(BlockingIOError, OSError):
+                asked = os.read(self.port.master, 4096)
+            heard = heard or asked != b''
+            # Nobody gets what was sent before it listened.
+            pending = pending + self._device.receive(asked, now - self.start_ns) + stream if heard else b''
             with contextlib.suppress(BlockingIOError, OSError):
                 pending = pending[os.write(self.port.master, pending) :]
 
@@ -115,7 +101,6 @@ class RunningDeviation:
 
 
 def evaluated(name: str, lost: int, growth: int, errors: RunningDeviation) -> bool:
-    """Print the verdict of one part."""
     good = lost == 0 and growth < ALLOWED_GROWTH and (not errors.count or errors.std <= ALLOWED_STD_NS)
     print(
         f'{name}: {lost} samples lost, memory {growth / 1e6:+.2f} MB after warm-up (allowed 2), '
@@ -182,7 +167,6 @@ def real_time(minutes: float) -> bool:
 
 
 def simulated_time(hours: float) -> bool:
-    """Decoder, numbers, clock and pipeline as fast as they go."""
     rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
     acquisition = Acquisition(rig, texts(lambda text: print(f'  said: {text}')))
     pipeline = Pipeline(rig)
@@ -232,7 +216,6 @@ def simulated_time(hours: float) -> bool:
 
 
 def main() -> int:
-    """Run both parts; exit status 0 where all is as it must be."""
     parser = options(__doc__)
     parser.add_argument('--minutes', type=float, default=30.0)
     parser.add_argument('--hours', type=float, default=24.0)

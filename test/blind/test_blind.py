@@ -92,6 +92,4 @@ def test_a_false_effect_fails_the_suite_unless_equivalent() -> None:
 
 def test_intervals_are_clopper_and_pearsons() -> None:
     # The rule of three: none of 300 leaves up to 1.2 %.
-    low, high = score.interval(0, 300)
-    assert low == 0.0
-    assert high == pytest.approx(1 - 0.025 ** (1 / 300))
+    assert score.share(0, 300) == f'0.0 % (0/300; 95 %: 0.0 to {100 * (1 - 0.025 ** (1 / 300)):.1f})'

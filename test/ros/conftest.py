@@ -2,12 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real rclpy and real DDS: a domain of its own for each worker, and the daemon as a process."""
 
-import fcntl
 import math
 import os
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 import pytest
 
 from test.run.conftest import ScriptedDevice
-from tools.program import PSD_DEFLECTION, WAIT_S, Program
+from tools.program import PSD_DEFLECTION, WAIT_S, Program, ros_domain
 
 pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
 
@@ -39,15 +37,8 @@ SEND_AGAIN_S = 1.0
 
 @pytest.fixture(scope='session')
 def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """A ROS_DOMAIN_ID that no other test on this machine uses, held by a lock."""
-    for candidate in range(20, 100):
-        path = Path(tempfile.gettempdir()) / f'psd_deflection_test_domain_{candidate}'
-        lock = path.open('w')
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            continue
+    """A ROS_DOMAIN_ID that no other test on this machine uses."""
+    with ros_domain() as candidate:
         os.environ['ROS_DOMAIN_ID'] = str(candidate)
         # A participant that restarts beside another is not heard any more, now and then, through Fast DDS's shared
         # memory (eProsima/Fast-DDS#5053). These tests restart a daemon beside a peer, and kill some.
@@ -55,9 +46,6 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         os.environ['ROS_LOG_DIR'] = str(tmp_path_factory.mktemp('ros_log'))
         os.environ['XDG_STATE_HOME'] = str(tmp_path_factory.mktemp('state'))
         yield candidate
-        lock.close()
-        return
-    pytest.fail('no ROS domain is free')
 
 
 PATIENT = f"""

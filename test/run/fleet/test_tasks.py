@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import pytest
 
-from bench.campaign.mortal import dies, length
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, DaemonError, RecordingError, UsageError
 from psd_deflection.run.fleet.tasks import (
@@ -24,6 +23,7 @@ from psd_deflection.run.fleet.tasks import (
     open_engine,
     outcomes,
 )
+from test.run.fleet.mortal import dies, length
 
 T = TypeVar('T')
 NAMES = ['a', 'bbb', 'rejected', 'cc', 'defect', 'dddd']

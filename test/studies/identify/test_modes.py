@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from blind.modes import CASES, RATE, Link, driven, noise, rung, scored
+from blind.generator import coloured
+from blind.modes import CASES, RATE, Link, driven, rung, scored
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import from_recordings
 from psd_deflection.studies.identify.from_recordings import read_identify
@@ -35,7 +36,7 @@ def test_intervals_hold_the_truth(name: str, frequency_off: float, damping_off: 
 
 def test_noise_that_remembers_has_no_mode() -> None:
     for seed in range(2):
-        samples = 2e-6 * noise(10_000, 0.9, np.random.default_rng(seed))
+        samples = 2e-6 * coloured(np.random.default_rng(seed).normal(size=10_000), 0.9)
         assert modes_of(samples, RATE).modes == ()
 
 

@@ -14,9 +14,9 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.stats import median_abs_deviation
 
-from blind.clock import ClockRecording, dots, scored, simulated
+from blind.clock import ClockRecording, scored, simulated
 from blind.clock import motion_of as motion_of_samples
-from blind.generator import Array
+from blind.generator import Array, flat_dots
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.validate import clock
@@ -89,7 +89,7 @@ def test_a_motion_that_repeats_has_rivals() -> None:
     run = simulated(9)
     t = run.t
     steady = np.column_stack([1e-3 * np.sin(2 * np.pi * 5.0 * t), np.zeros((len(t), 2))])
-    motion = motion_of_samples(t, dots(steady))
+    motion = motion_of_samples(t, flat_dots(steady))
     noise = np.random.default_rng(0).normal(0.0, [10e-6, 10e-6, 3e-4], run.poses.shape)
     at = run.stamps + run.offset
     poses = np.column_stack([1e-3 * np.sin(2 * np.pi * 5.0 * at), np.zeros((len(at), 2))]) + noise

@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from blind.clock import dots
+from blind.generator import flat_dots
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.solvers.registry import SOLVERS
@@ -147,7 +147,7 @@ BLOCKS = [
     for i in range(2)
 ]
 POSES = np.array([[1e-3, -2e-3, 0.01], [0.0, 0.0, 0.0], [-2e-3, 1e-3, -0.02]])
-SAMPLES = TrustedSamples(START + np.array([0, 1_000_000, 2_500_000]), dots(POSES), np.array([1e-6, 2e-6, 3e-6]))
+SAMPLES = TrustedSamples(START + np.array([0, 1_000_000, 2_500_000]), flat_dots(POSES), np.array([1e-6, 2e-6, 3e-6]))
 OWN = References(START + np.array([-500_000_000, 1_500_000_000]), POSES[:2], POSES[1:], {'blurred': 2})
 OTHERS = References(START + np.array([250_000_000]), POSES[2:])
 
@@ -198,10 +198,10 @@ def test_the_references_are_those_of_the_recording_or_of_a_file(run: Opened) -> 
 def test_a_solver_gives_the_pose_or_none(run: Opened) -> None:
     found = read_validate(run, solvers=['beam', 'wls'])
     assert list(found.solvers) == ['exact', 'beam', 'wls']
-    np.testing.assert_allclose(found.motion.solve(dots(POSES)), POSES, atol=1e-12)
+    np.testing.assert_allclose(found.motion.solve(flat_dots(POSES)), POSES, atol=1e-12)
     assert found.motion.solve is found.solvers['exact']
     # No rigid plate has dots like these: the beam says that it did not converge, and where it was then.
-    lost = dots(POSES)
+    lost = flat_dots(POSES)
     lost[1] = [0.3, 0.3, -0.3, 0.3]
     assert np.isnan(found.solvers['beam'](lost)).tolist() == [[False] * 3, [True] * 3, [False] * 3]
 
