@@ -273,10 +273,12 @@ def watch(recording: Recording | str | Path, rig: Rig | str | Path | None = None
     :class:`~psd_deflection.base.errors.SolverError`.
     """
     import warnings
+    from pathlib import Path
 
     from psd_deflection.recordings.recording import Recording
     from psd_deflection.recordings.replay.engine import rig_at_start, warnings_about_rig
     from psd_deflection.rig.config import Rig
+    from psd_deflection.studies.study import Opened
     from psd_deflection.studies.watch.from_recordings import watch as of_recording
 
     given = recording if isinstance(recording, Recording) else open(recording)
@@ -284,8 +286,8 @@ def watch(recording: Recording | str | Path, rig: Rig | str | Path | None = None
     if rig is None:
         for warning in warnings_about_rig(given):
             warnings.warn(warning, stacklevel=2)
-    described = 'the parameters in the recording' if rig is None else str('a Rig' if isinstance(rig, Rig) else rig)
-    sources = {'recording': str(given.path), 'rig': described}
+    file = None if rig is None or isinstance(rig, Rig) else Path(rig)
+    sources = Opened(given, known, file, given=rig is not None).sources
     return of_recording(given.with_block_size(known.estimator.block_size), known, sources)
 
 

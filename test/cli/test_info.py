@@ -116,12 +116,16 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
     assert found['lost'] == 0
 
 
-def test_an_older_word_for_a_default_is_no_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    old = {**load_rig().flat(), 'degraded': 'off'}
-    with BagWriter(tmp_path / 'old', rig_values=old) as out:
-        out.put(block(0))
-    assert main(['info', str(tmp_path / 'old')]) == 0
-    assert 'all parameters at their defaults' in capsys.readouterr().out
+def test_only_recorded_parameters_are_reported_as_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    every = load_rig().flat()
+    links = {k: v for k, v in every.items() if k.startswith('link.')}
+    for values, heading in (({**every, 'degraded': 'off'}, 'all'), (links, 'the recorded')):
+        with BagWriter(tmp_path / heading, rig_values=values) as out:
+            out.put(block(0))
+        assert main(['info', str(tmp_path / heading)]) == 0
+        told = capsys.readouterr().out
+        assert f'  {heading} parameters at their defaults' in told
+        assert (f'{len(every) - len(links)} parameters of a rig are not in the recording' in told) == (values is links)
 
 
 def test_convert_there_and_back_keeps_every_bit(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,6 +52,12 @@ def test_every_option_named_on_a_page_is_declared() -> None:
     assert {(page, option) for page, option in named if option not in declared} == set()
 
 
+def test_every_parameter_that_a_page_sets_is_declared() -> None:
+    named = {m[1] for _, code in SPOKEN if (m := re.fullmatch(r'([a-z]+[_.][a-z_.0-9]*): \S.*', code))}
+    assert len(named) > 10
+    assert named <= set(BY_NAME)
+
+
 def rows(page: str) -> dict[str, list[str]]:
     """The first three cells of each row whose first cell has names, by name; several names share a row."""
     found: dict[str, list[str]] = {}

@@ -5,6 +5,7 @@
 import hashlib
 import subprocess
 import sys
+import warnings
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -169,6 +170,8 @@ def test_an_answer_names_where_its_rig_is_from(tmp_path: Path, recording: str, r
         path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]))
     given = {None: None, 'file': ROOT / 'config' / 'thesis_rig.yaml', 'object': psd_deflection.load_rig()}[rig]
     assert opened(open_recording(path), given, notify=lambda _: None).sources['rig'] == words
+    with warnings.catch_warnings(action='ignore'):
+        assert psd_deflection.watch(path, given).sources['rig'] == words
 
 
 def test_every_channel_is_drawn_with_the_marks() -> None:

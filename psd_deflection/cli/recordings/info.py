@@ -32,6 +32,7 @@ from psd_deflection.recordings.recording import EPOCH_FROM_NS
 from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.summary import summary
 from psd_deflection.recordings.write.parquet import ERROR, Field, ParquetFile
+from psd_deflection.rig.config import load_rig
 
 FIELDS = (
     ERROR,
@@ -221,11 +222,14 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
 
 def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
     out: list[str] = []
+    unknown = len(set(load_rig().flat()).difference(found['parameters'])) if found['parameters'] else 0
     if found['parameters'] and not found['changed_parameters']:
-        out.append('  all parameters at their defaults')
+        out.append(f'  {"the recorded" if unknown else "all"} parameters at their defaults')
     elif found['parameters']:
         out.append('  parameters that are not at their defaults')
         out += [f'    {k} = {v}' for k, v in sorted(found['changed_parameters'].items())]
+    if unknown:
+        out.append(f'  {unknown} parameters of a rig are not in the recording')
     if found['as_in_the_thesis']:
         out.append('  parameters as in the thesis rig, unless they were measured to be the same')
         out += [f'    {text}' for text in found['as_in_the_thesis']]

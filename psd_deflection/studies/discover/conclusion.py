@@ -23,6 +23,7 @@ from psd_deflection.model.simulation.laws import Law, effect_of, law_text, value
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
+from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS
 from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
@@ -400,17 +401,18 @@ def _setup(discovery: RigConclusion) -> str:
     """What is wrong with the set-up, in a sentence, or nothing."""
     where: dict[str, dict[str, None]] = {}
     for f in discovery.setup:
-        where.setdefault(f.name, {})[f'{f.where}{_seconds(f)}'] = None
+        place = '' if f.where == ' '.join(LOADS) else f.where
+        where.setdefault(f.name.replace('_', ' '), {})[', '.join(filter(None, (place, _seconds(f))))] = None
     names = [f'{name} ({"; ".join(places)})' for name, places in where.items()]
     return f'The set-up is not as the rig file or the recording says: {", ".join(names)}.' if names else ''
 
 
 def _seconds(finding: Finding) -> str:
     """How late a load was noted, or how long it took."""
-    if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_ramp'):
+    if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_delay', 'load_ramp'):
         return ''
     direction = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
-    return f', {abs(finding.value):.3g} s{direction}'
+    return f'{abs(finding.value):.3g} s{direction}'
 
 
 def _moved(discovery: RigConclusion) -> str:

@@ -54,12 +54,8 @@ class Validated(StudyResult):
         return self.problem.sources
 
     def sentences(self) -> list[str]:
-        """Clock, bias and scale of each axis, cover, and what was left out."""
-        out = [self.offset.sentence]
-        if self.applied:
-            out.append('The offset is removed in what follows.')
-        elif self.offset.determined and abs(self.offset.value) > 1.96 * self.offset.sd:
-            out.append('It is not removed in what follows; --align removes it.')
+        """Bias and scale of each axis, cover, clock, and what was left out."""
+        out = []
         for i, name in enumerate(SYMBOLS):
             a = self.agreements[self.solver][i]
             text = (
@@ -77,6 +73,11 @@ class Validated(StudyResult):
         if math.isfinite(self.covered[0]):
             cover = ', '.join(f'{n} {100.0 * c:.1f} %' for n, c in zip(SYMBOLS, self.covered, strict=True))
             out.append(f'Differences within 1.96 standard deviations of both instruments (95 % expected): {cover}.')
+        out.append(self.offset.sentence)
+        if self.applied:
+            out.append('The offset was removed before the comparison.')
+        elif self.offset.determined and abs(self.offset.value) > 1.96 * self.offset.sd:
+            out.append('It was not removed; --align removes it.')
         if self.excluded:
             total = len(self.t) + self.excluded
             out.append(f'{self.excluded} of {total} references have no samples about them and are left out.')

@@ -738,7 +738,7 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     )
     setup = (Finding('channel_sign', 'y1', -1.0, 'x'), Finding('channel_sign', 'y1', -1.0, 'y'))
     assert sentence(verdict='nothing_missing', effects=(), setup=setup) == (
-        'The set-up is not as the rig file or the recording says: channel_sign (y1). '
+        'The set-up is not as the rig file or the recording says: channel sign (y1). '
         f'Nothing is missing besides: the gap is {left}.'
     )
     tree = dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)).tree()
