@@ -23,8 +23,8 @@ from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import declared_size
 from psd_deflection.camera.reference import CameraReference, mean_pose, relative, relative_covariance
 from psd_deflection.camera.refine_corners import refined
-from psd_deflection.camera.rim_classifier import sectors_of
-from psd_deflection.camera.rim_model import Shape, moved, rotation_matrix
+from psd_deflection.camera.rim_classifier import RimClassifier, sectors_of
+from psd_deflection.camera.rim_model import PosePrior, Shape, expected, moved, rotation_matrix
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.camera.target import target_of
 from psd_deflection.records import FloatArray
@@ -118,8 +118,24 @@ def test_a_rim_has_sixteen_parts_of_equal_angle() -> None:
 @pytest.mark.parametrize('size', [0.0, 1e-10, 1e-8, 1.0])
 def test_a_turn_is_that_of_its_vector_however_small(size: float) -> None:
     vector = size * np.array([0.6, -0.3, 0.2])
-    expected = Rotation.from_rotvec(vector).as_matrix()
-    np.testing.assert_allclose(rotation_matrix(vector), expected, atol=1e-16 + 1e-15 * size)
+    want = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rotation_matrix(vector), want, atol=1e-16 + 1e-15 * size)
+
+
+def test_keystone_and_error_of_centres_turn_with_the_target() -> None:
+    prior, c, s = PosePrior(rotation_matrix(np.array([0.0, 0.0, 0.7])), 0.1, np.array([0.3, -0.1])), 0.8, 0.6
+    turned = expected(prior, rotation_matrix(np.array([0.0, 0.0, 0.7 - math.atan2(s, c)])))
+    assert turned == pytest.approx([c * 0.3 + s * 0.1, s * 0.3 - c * 0.1])
+    rotation = rotation_matrix(np.array([0.4, -0.3, 0.2]))
+    shape = Shape(rotation, np.array([0.0, 0.0, 0.5]), 1.0, np.eye(2), np.zeros(4), np.zeros((3, 6)), np.zeros(2))
+    judge = RimClassifier(
+        cast(Any, SimpleNamespace(focal=1000.0)), 100, np.array([[0.03, 0.0], [0.0, 0.04], [0.0, 0.0]])
+    )
+    covariance = judge.moved_centres(shape, 2.0)
+    # Two pixels are a millimetre at the target: in its plane, and about its normal.
+    in_plane = np.eye(3) - np.outer(rotation[:, 2], rotation[:, 2])
+    np.testing.assert_allclose(covariance[3:, 3:], 1e-6 * in_plane, atol=1e-20)
+    assert covariance[2, 2] == pytest.approx(1e-6 / 0.05**2)
 
 
 def test_a_fit_stays_within_its_bounds() -> None:

@@ -55,6 +55,13 @@ def test_levels_are_within_what_is_reported_of_them_in_95_of_100(nominal: Rig) -
     assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
 
 
+def test_the_error_of_twenty_pieces_is_students(nominal: Rig) -> None:
+    """Means that alternate by 1 mV, so that none follows from the one before."""
+    volts = np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + np.repeat(1e-3 * (-1.0) ** np.arange(20), 250)[:, None]
+    (one, _) = dark_levels([run_of(volts)], nominal)
+    assert one.sd == pytest.approx(np.full(3, 2.093024 / 1.959964 * 1e-3 / 19**0.5), rel=1e-5)
+
+
 def test_the_error_of_white_noise_is_that_of_a_mean(nominal: Rig) -> None:
     (one, _) = dark_levels([run_of(white((1.0, 2.0, 0.1, 0.0, 0.0, 0.1), 16_000))], nominal)
     assert one.sd == pytest.approx(np.full(3, 2e-3 / 16_000**0.5), rel=0.45)
