@@ -12,10 +12,11 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, savgol_filter
 from scipy.stats import chi2
 
-from blind.campaign import chunk, options, watched
+from blind.campaign import chunk as chunk_of
+from blind.campaign import options, watched
 from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, flat_dots, output
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.records import BaseAcceleration, TipMotion
+from psd_deflection.records import BaseAcceleration, RawChunk, TipMotion
 from psd_deflection.rig.config import Rig, load_rig
 
 LENGTH = 0.585
@@ -198,6 +199,11 @@ class Result:
     unseen: Array
 
 
+def chunk(run: Run, block: int) -> RawChunk:
+    """Block number ``block`` of the run."""
+    return chunk_of(run.volts[BLOCK * block : BLOCK * (block + 1)], BLOCK * block)
+
+
 def rig_of(changes: Mapping[str, object] | None = None) -> Rig:
     return load_rig(None, {'filter': 'modal', 'solvers': ['exact'], **(changes or {})})
 
@@ -254,8 +260,7 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
         before = motion.innovations
         while reported and there(reported[0]) < BLOCK * (block + 1):
             pipeline.accelerate(reported.pop(0))
-        volts = run.volts[BLOCK * block : BLOCK * (block + 1)]
-        for record in pipeline.process(chunk(volts, BLOCK * block)):
+        for record in pipeline.process(chunk(run, block)):
             if isinstance(record, TipMotion):
                 at = BLOCK * (block + 1) - 1
                 velocity[block] = np.array([record.vx, record.vy, record.vtheta]) - run.velocity[at]
