@@ -203,7 +203,7 @@ def record(made: Bench, load_case: HeldLoad) -> None:
 
 def table(path: Path) -> dict[str, Array]:
     """Columns of a CSV; what is empty or a word is NaN."""
-    rows = np.genfromtxt(path, delimiter=',', names=True, dtype=np.float64)
+    rows: Any = np.genfromtxt(path, delimiter=',', names=True, dtype=np.float64)
     return {name: rows[name] for name in rows.dtype.names or ()}
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from bench.campaign.line import hello_of
 from blind.campaign import options
 from psd_deflection.base.log import texts
-from psd_deflection.devices.contract_frames import PowerUp, SimulatedFrames
+from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.device import PowerUp
 from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.devices.rig_feed import RigFeed
