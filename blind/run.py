@@ -23,16 +23,16 @@ from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
 
 COUNTS = (
-    ('seeds', 4, 'draws of each effect and gap'),
-    ('nulls', 300, 'without an effect'),
-    ('wrong', 102, 'the same, with other noise'),
-    ('pairs', 60, 'two effects'),
-    ('spreads', 60, 'pairs and triples of very different size'),
-    ('mistakes', 5, 'sizes of each mistake of the set-up'),
-    ('fours', 40, 'four effects at once'),
-    ('sixes', 20, 'six effects at once'),
-    ('hand', 44, 'loads applied and noted by hand'),
-    ('first', 0, 'number of the first seed: fresh cases'),
+    ('--seeds', 4, 'draws of each effect and gap'),
+    ('--nulls', 300, 'without an effect'),
+    ('--wrong', 102, 'the same, with other noise'),
+    ('--pairs', 60, 'two effects'),
+    ('--spreads', 60, 'pairs and triples of very different size'),
+    ('--mistakes', 5, 'sizes of each mistake of the set-up'),
+    ('--fours', 40, 'four effects at once'),
+    ('--sixes', 20, 'six effects at once'),
+    ('--hand', 44, 'loads applied and noted by hand'),
+    ('--first', 0, 'number of the first seed: fresh cases'),
 )
 """Options of the selection: so many cases."""
 _BANKS: dict[str, SignatureBank] = {}
@@ -121,11 +121,11 @@ def selection(parser: argparse.ArgumentParser) -> Callable[[argparse.Namespace],
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
     parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
     for name, default, words in COUNTS:
-        parser.add_argument(f'--{name}', type=int, default=default, help=f'{words} (default: %(default)s)')
+        parser.add_argument(name, type=int, default=default, help=f'{words} (default: %(default)s)')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
 
     def chosen(args: argparse.Namespace) -> list[Case]:
-        counts = {name: getattr(args, name) for name, *_ in COUNTS}
+        counts = {name[2:]: getattr(args, name[2:]) for name, *_ in COUNTS}
         listed = short_cases() if args.short else all_cases(**counts)
         return [c for c in listed if args.only in c.key]
 
