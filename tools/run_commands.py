@@ -59,7 +59,7 @@ LIVE = re.compile(
     r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
     r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
-BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b')
+BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b|^ros2 run tf2_ros ')
 """Nodes that run beside the lines below them."""
 
 AT_THE_BENCH = re.compile(r'^psd-deflection calibrate --live\b')
@@ -165,8 +165,8 @@ def blocks_to_run() -> list[list[Command]]:
         if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
             continue
         left = [c for c in block if run_by_ci(c.line) is None and typed_as(c.line) not in observed]
-        # The lines below it may need what a simulation writes, and nothing else that is quick.
-        left = [c for c in left if not is_quick(c.line) or ' simulate ' in c.line]
+        # The lines below it may need what a quick one writes.
+        left = [c for c in left if not is_quick(c.line) or ' --out ' in c.line]
         observed.update(typed_as(c.line) for c in left)
         if left:
             out.append(left)
@@ -315,7 +315,7 @@ class Reader:
 
 
 def main() -> int:
-    """Run them all, or those that hold the words given, as ``PAGE: LINE``; the exit status is 1 where one failed.
+    """Run all blocks, or those with the words given in a ``PAGE: LINE``; the exit status is 1 where one failed.
     ``--no-campaigns``: without those that have a short form."""
     # A shell that runs us in the background has it ignored, and so would all that we start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -339,6 +339,9 @@ def main() -> int:
             XDG_STATE_HOME=f'{temporary}/state',
         )
         reader = Reader(folder)
+        if shutil.which('ros2'):
+            # Without it the first `ros2 lifecycle` sees what it meets in half a second.
+            subprocess.run(['ros2', 'daemon', 'start'], check=True)
 
         def ran(line: str, seconds: float, failed: str) -> None:
             nonlocal failures
@@ -350,7 +353,7 @@ def main() -> int:
         passed_over: dict[str, list[str]] = {}
         try:
             for block in blocks_to_run():
-                lines = [c.line for c in block if only in f'{c.page}: {c.line}']
+                lines = [c.line for c in block] if any(only in f'{c.page}: {c.line}' for c in block) else []
                 for line in [*lines]:
                     if not campaigns and is_campaign(line):
                         lines.remove(line)
@@ -362,6 +365,8 @@ def main() -> int:
                 reader.block(lines, ran)
         finally:
             reader.close()
+            if shutil.which('ros2'):
+                subprocess.run(['ros2', 'daemon', 'stop'], check=True)
         for missing, lines in passed_over.items():
             where = ', run by the apt job of .github/workflows/ci.yml' if missing == 'ros2' else ''
             why = 'because of' if missing == NO_CAMPAIGNS else 'for want of'
