@@ -51,33 +51,41 @@ def our_rows(root: Path) -> str:
     return found[1]
 
 
-def prepared(rosdistro: Path, tools: Path, into: Path, ours: str = '') -> dict[str, str]:
-    """The environment with which rosdep and bloom read the rows ``ours``, then ``rosdistro``. Fills ``into``."""
+def written(rosdistro: Path, into: Path, ours: str = '', root: Path = Path('/')) -> dict[str, str]:
+    """What rosdep and bloom read the rows ``ours``, then ``rosdistro`` by, seen from ``root``. Fills ``into``."""
+
+    def url(path: Path) -> str:
+        return f'file:///{path.resolve().relative_to(root.resolve())}'
+
     lists = into / 'sources'
     lists.mkdir(parents=True)
     if ours:
         (into / 'ours.yaml').write_text(ours)
-        (lists / '10-ours.list').write_text(f'yaml file://{(into / "ours.yaml").resolve()}\n')
-    files = [f'yaml file://{(rosdistro / "rosdep" / name).resolve()}.yaml\n' for name in ('base', 'python', 'ruby')]
+        (lists / '10-ours.list').write_text(f'yaml {url(into / "ours.yaml")}\n')
+    files = [f'yaml {url(rosdistro / "rosdep" / name)}.yaml\n' for name in ('base', 'python', 'ruby')]
     (lists / '20-default.list').write_text(''.join(files))
     index = yaml.safe_load((rosdistro / 'index-v4.yaml').read_text())
     wanted = {ros for _, ros in SYSTEMS.values()}
     index['distributions'] = {name: index['distributions'][name] for name in sorted(wanted)}
     for name, entry in index['distributions'].items():
         # The cache of the build farm is not in the checkout; rosdep needs of it what the distribution's file has.
-        source = (rosdistro / name / 'distribution.yaml').resolve()
+        source = rosdistro / name / 'distribution.yaml'
         content = yaml.load(source.read_text(), getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
         cache = {'name': name, 'type': 'cache', 'version': 2, 'distribution_file': [content]}
         text = json.dumps({**cache, 'release_package_xmls': {}, 'source_repo_package_xmls': {}}, default=str)
         (into / f'{name}-cache.yaml').write_text(text)
-        entry.update(distribution=[f'file://{source}'], distribution_cache=f'{name}-cache.yaml')
+        entry.update(distribution=[url(source)], distribution_cache=f'{name}-cache.yaml')
     (into / 'index-v4.yaml').write_text(yaml.safe_dump(index))
+    return {'ROSDEP_SOURCE_PATH': url(lists)[7:], 'ROSDISTRO_INDEX_URL': url(into / 'index-v4.yaml')}
+
+
+def prepared(rosdistro: Path, tools: Path, into: Path, ours: str = '') -> dict[str, str]:
+    """The environment with which rosdep and bloom on this machine read what ``written`` writes."""
     env = {
         **os.environ,
+        **written(rosdistro, into, ours),
         'HOME': str(into),
         'ROS_HOME': str(into / 'ros'),
-        'ROSDEP_SOURCE_PATH': str(lists),
-        'ROSDISTRO_INDEX_URL': f'file://{(into / "index-v4.yaml").resolve()}',
         'PATH': f'{(tools / "bin").absolute()}{os.pathsep}{os.environ["PATH"]}',
     }
     subprocess.run([tools / 'bin/rosdep', 'update'], env=env, check=True, capture_output=True)

@@ -43,7 +43,7 @@ ADMINISTRATION = re.compile(
 
 HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says nothing: never run here.
 
-FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b)')
+FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b|make release STEP=apt\b)')
 """Reads data of others, which are not in the repository."""
 
 NO_CAMPAIGNS = '--no-campaigns'
@@ -220,6 +220,7 @@ class Reader:
             self._background.clear()
 
     def type(self, line: str) -> None:
+        line += next((f' {arguments}' for pattern, arguments in SHORTER.items() if re.search(pattern, line)), '')
         line = line.replace('/dev/ttyACM0', 'ttyACM0').replace('/dev/pts/3', self._served)
         if 'ttyACM0' in line and self._device is None:
             self._device = self._start('psd-deflection simulate --serve --link ttyACM0')
@@ -245,8 +246,7 @@ class Reader:
             if line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')) and not self._background:
                 self._background.append(self._start('psd-deflection estimator'))
                 self._background[-1].until(r'θ +[-+]\d')
-            more = next((arguments for pattern, arguments in SHORTER.items() if re.search(pattern, line)), '')
-            self._to_the_end(f'{line} {more}')
+            self._to_the_end(line)
 
     def _start(self, line: str) -> Program:
         """The line in a terminal, as a person types it."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import html
+import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -220,7 +221,14 @@ def described(rig: Rig, effects: Iterable[ActiveEffect]) -> str:
     tree = nested({name: rig.values[name] for name in DESCRIPTION})
     if given := list(effects):
         tree['effects'] = effects_to_values(given)
-    return yaml.safe_dump({'/**': {'ros__parameters': tree}}, sort_keys=False, allow_unicode=True)
+    return yaml.dump({'/**': {'ros__parameters': tree}}, Dumper=_Quoting, sort_keys=False, allow_unicode=True)
+
+
+class _Quoting(yaml.SafeDumper):
+    """Quotes the names of axes, as PyYAML alone does not: to rcl y is true."""
+
+
+_Quoting.add_implicit_resolver('tag:yaml.org,2002:bool', re.compile('[yYnN]$'), list('yYnN'))
 
 
 def edited_rig_file(

@@ -12,11 +12,14 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, List  # noqa: UP035, launch knows no list[str]
 
 import pytest
+import rclpy
 
 from psd_deflection.arms.chains import chain_file
 from psd_deflection.arms.compensation import settings
+from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import Parameter
+from psd_deflection.studies.study import described
 
 LAUNCH = Path(__file__).parent.parent.parent / 'launch'
 FILE = LAUNCH / 'estimator.launch.py'
@@ -135,3 +138,10 @@ def test_ros2_launch_shows_the_arguments() -> None:
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     for name in ('namespace', 'autostart', 'solver', 'log_level', 'port'):
         assert f"'{name}':" in shown
+
+
+def test_rcl_reads_the_rig_file_that_a_study_writes(tmp_path: Path) -> None:
+    rig, context = tmp_path / 'rig.yaml', rclpy.Context()
+    rig.write_text(described(load_rig(), []))
+    rclpy.init(args=['--ros-args', '--params-file', str(rig)], context=context)
+    rclpy.shutdown(context=context)
