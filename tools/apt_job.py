@@ -72,7 +72,10 @@ def ready(chroot: Path, ros: Path, rosdistro: Path) -> dict[str, str]:
         command = ['debootstrap', '--variant=minbase', 'bookworm', str(chroot)]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     shutil.copy2(ROOT / 'packaging/ubuntu-24.04.txt', chroot / 'opt')
-    subprocess.run(inside(chroot, f"bash -euc '{IMAGE}'"), check=True, stdout=subprocess.DEVNULL)
+    made = chroot / 'opt/image'
+    if not made.is_file() or made.read_text() != IMAGE:
+        subprocess.run(inside(chroot, f"bash -euc '{IMAGE}'"), check=True, stdout=subprocess.DEVNULL)
+        made.write_text(IMAGE)
     for name in ('root/ws', 'root/temp', 'opt/ros', 'opt/rosdistro', 'opt/rosdep'):
         shutil.rmtree(chroot / name, ignore_errors=True)
     shutil.copytree(ros, chroot / 'opt/ros/jazzy', symlinks=True)
@@ -119,7 +122,8 @@ def main(argv: list[str] | None = None) -> int:
         with log.open('wb') as out:
             status = subprocess.run(inside(chroot, shell), stdout=out, stderr=out, check=False).returncode
         print(f'{"FAILED" if status else "passed"} {time.monotonic() - begun:5.0f} s {step["name"]}', flush=True)
-        print(*told, *(log.read_text(errors='replace').splitlines()[-40:] if status else []), sep='\n', flush=True)
+        told += log.read_text(errors='replace').splitlines()[-40:] if status else []
+        print(*(f'{line}\n' for line in told), sep='', end='', flush=True)
         failed += status != 0
     print(f'{failed} steps failed, load {os.getloadavg()[0]:.1f}; stood in for: ROS from apt, tf2_ros, rosdistro')
     return 1 if failed else 0
