@@ -47,6 +47,8 @@ UNTOLD = 'the controller does not tell the offsets that it applies'
 UNKNOWN_COMMAND = 'the controller does not tell the command that it has'
 AWAITED = 'good deflections are awaited'
 UNVERIFIED = 'not yet verified, the offsets have not been seen to move the joints of an arm at rest'
+ARRIVED_SHARE = 0.01
+"""What was sent has arrived if the controller tells it within this share of ``follow_error``."""
 UNSEEN_SHARE = 0.1
 """Of what all offsets do to the end effector, what those of unverified joints may do."""
 FOREIGN = 1e-6
@@ -235,7 +237,7 @@ class Compensator:
         before, then = self._joints, self._joints_t
         self._joints, self._joints_t = observed, now - max(age, 0.0)
         self._at_joints = self._offsets
-        wrong = self.response.add(now, observed, self._offsets, self.settings.follow_error)
+        wrong = self.response.add(now, observed, self._offsets, self.settings.follow_error, self._arrived(now))
         if wrong is not None and self._speaks and not self._dry:
             self._broken = self._broken or self.response.wrong(self.arm.names, wrong)
         if before is None:
@@ -250,6 +252,14 @@ class Compensator:
         if reversed_by.max() > settings.follow_error:
             self._hold(f'the positions of the joints go to and fro by {reversed_by.max():.3g}')
         self._last_move = move
+
+    def _arrived(self, now: float) -> bool:
+        """Whether the controller tells what it was sent; joints do not follow what is on its way."""
+        if self._has is None or not self._speaks or self._dry or not (self._sums or self.settings.takeover):
+            return True
+        asked = self._offsets if self._pose is None else self._pose + self._offsets
+        late = np.abs(self._has - asked).max() > ARRIVED_SHARE * self.settings.follow_error
+        return not late and now - self._has_t <= self.settings.stale
 
     def observe(self, now: float, observed: Observed) -> Command:
         """Take a deflection at the time ``now``; return what :meth:`watch` gave last, with the state of now."""

@@ -69,10 +69,13 @@ class JointResponse:
         right[list(self.candidates)] = False
         return right
 
-    def add(self, now: float, joints: FloatArray, offsets: FloatArray, follow_error: float) -> int | None:
+    def add(
+        self, now: float, joints: FloatArray, offsets: FloatArray, follow_error: float, arrived: bool = True
+    ) -> int | None:
         """Take measured positions and the offsets sent, (n,) each, at ``now``, s; the joint whose slope is wrong.
 
-        ``follow_error``: the step of an encoder that has shown one reading only, rad or m.
+        ``follow_error``: the step of an encoder that has shown one reading only, rad or m. ``arrived``: whether the
+        controller has these offsets; until then an arm that stands is not at rest.
         """
         elapsed = max(now - self._last_t, 0.0)
         if now < self._pause_t or (self._rows and elapsed < self._spacing):
@@ -81,7 +84,7 @@ class JointResponse:
         shares = np.array([-np.expm1(-elapsed / lag) if lag else 1.0 for lag in LAGS_S])[:, None]
         self._lagged = self._lagged + (offsets - self._lagged) * shares
         self._rows.append((now, joints, self._lagged))
-        rests = self._rests(now, REST_SHARE * follow_error)
+        rests = arrived and self._rests(now, REST_SHARE * follow_error)
         if not self._begun:
             self._begun = rests
             # Rows of before, but for one, would be of an arm that moved.

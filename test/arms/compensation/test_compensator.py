@@ -665,6 +665,26 @@ def test_a_controller_that_changes_its_scale_holds(arm: Arm) -> None:
     assert math.isnan(command.residual)
 
 
+def test_joints_are_not_blamed_for_offsets_on_their_way(arm: Arm) -> None:
+    """Offsets move for 60 ms, then no deflection comes; the controller has the offsets half a second later."""
+    loop = reporting(arm)
+    for n in range(6):
+        loop.plant.force = PAYLOAD * (0.5 + 0.5 * (n % 2))
+        before = loop.offsets
+        for period in range(28):
+            loop.t += PERIOD
+            loop.plant.step(ELBOW + before, PERIOD)
+            loop.compensator.joints(loop.t, loop.plant.angles)
+            loop.compensator.controller_has(loop.t, before)
+            if period < 3:
+                loop.compensator.observe(loop.t, observed(loop, t=loop.t))
+            loop.whys.add(loop.send(loop.t).why)
+        assert np.abs(loop.offsets - before).max() > 1e-3
+        assert not loop.compensator.response.candidates
+        loop.run(2.2)
+    assert not [why for why in loop.whys if 'of its offset' in why]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('delayed', [0.0, 0.02, 0.3])
 def test_an_arm_that_moves_by_itself_is_not_blamed(arm: Arm, delayed: float) -> None:
