@@ -252,3 +252,10 @@ def test_too_many_outlines_are_a_reason() -> None:
     with pytest.raises(NoPoseError) as rejected:
         find_discs(np.kron(blocks, np.ones((3, 3), np.uint8)), 3.0)
     assert rejected.value.status is Status.CLUTTERED
+
+
+@pytest.mark.parametrize('text', ['-1_0', '٣'])
+def test_a_time_of_a_frame_that_is_no_number_is_rejected(text: str, tmp_path: Path) -> None:
+    (tmp_path / 'frames.csv').write_text(f'file,t,exposure\na.png,{text},0\n')
+    with pytest.raises(RecordingError, match=r"column t holds '.*', which is not a number"):
+        Footage(str(tmp_path), 0.0)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``chain``, ``compensator`` and ``shaper`` without ROS, and commands that need it on a machine without it."""
 
+import argparse
 import csv
 import importlib.util
 import json
@@ -13,10 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.arms.compensation.settings import SHAPING, shaper_of
+from psd_deflection.arms.compensation.settings import SETTINGS, SHAPING, shaper_of
+from psd_deflection.base.errors import UsageError
+from psd_deflection.cli import _options
 from psd_deflection.cli._options import of_options
 from psd_deflection.cli.main import main, make_parser
 from psd_deflection.model.link.shapers import Shaper, in_series, recommended, shaper
+from psd_deflection.rig.parameters import Parameter, Section
 from tools.program import ROOT
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -100,3 +104,34 @@ def test_full_shared_memory_is_reported_before_ros_starts(
     assert main(words) == 71
     assert asked == ['/dev/shm']
     assert '/dev/shm has 61440 bytes left, ROS 2 needs 65536: delete what nobody uses' in capsys.readouterr().err
+
+
+SECTIONS: list[Section[Any]] = [SETTINGS, SHAPING]
+
+
+def as_written(declared: Parameter) -> str:
+    """The default, as a person writes it."""
+    default = declared.default
+    if isinstance(default, bool):
+        return str(default).lower()
+    return ','.join(map(str, default)) if isinstance(default, list) else str(default)
+
+
+@pytest.mark.parametrize('section', SECTIONS)
+def test_the_default_of_every_option_can_be_written(section: Section[Any]) -> None:
+    parser = argparse.ArgumentParser()
+    _options.section_options(parser, section)
+    written = [(p.name.replace('_', '-'), as_written(p)) for p in section.parameters.values()]
+    words = [f'--{name}={text}' for name, text in written if text]
+    assert words
+    given = parser.parse_args(words)
+    assert _options.of_options(given, section) == _options.of_options(parser.parse_args([]), section)
+
+
+def test_a_switch_takes_true_and_false() -> None:
+    parser = argparse.ArgumentParser()
+    _options.section_options(parser, SECTIONS[0])
+    assert parser.parse_args(['--takeover', 'false']).takeover is False
+    assert parser.parse_args(['--takeover', 'True']).takeover is True
+    with pytest.raises(UsageError, match='must be true or false'):
+        parser.parse_args(['--takeover=maybe'])

@@ -8,16 +8,12 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from psd_deflection.arms.compensation.settings import SETTINGS, SHAPING
-from psd_deflection.base.errors import EXIT_STATUSES, UsageError
-from psd_deflection.cli import _options
+from psd_deflection.base.errors import EXIT_STATUSES
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.cli.params import NEEDED
-from psd_deflection.rig.parameters import Parameter, Section
 
 ROOT = Path(__file__).parent.parent.parent
 BAGS = ROOT / 'bags'
@@ -145,34 +141,3 @@ def test_its_examples_run(
             continue
         # A recording of another machine may differ in its last bits.
         assert main(argv) in ((0, 1) if '--compare' in argv else (0,)), line
-
-
-SECTIONS: list[Section[Any]] = [SETTINGS, SHAPING]
-
-
-def as_written(declared: Parameter) -> str:
-    """The default, as a person writes it."""
-    default = declared.default
-    if isinstance(default, bool):
-        return str(default).lower()
-    return ','.join(map(str, default)) if isinstance(default, list) else str(default)
-
-
-@pytest.mark.parametrize('section', SECTIONS)
-def test_the_default_of_every_option_can_be_written(section: Section[Any]) -> None:
-    parser = argparse.ArgumentParser()
-    _options.section_options(parser, section)
-    written = [(p.name.replace('_', '-'), as_written(p)) for p in section.parameters.values()]
-    words = [f'--{name}={text}' for name, text in written if text]
-    assert words
-    given = parser.parse_args(words)
-    assert _options.of_options(given, section) == _options.of_options(parser.parse_args([]), section)
-
-
-def test_a_switch_takes_true_and_false() -> None:
-    parser = argparse.ArgumentParser()
-    _options.section_options(parser, SECTIONS[0])
-    assert parser.parse_args(['--takeover', 'false']).takeover is False
-    assert parser.parse_args(['--takeover', 'True']).takeover is True
-    with pytest.raises(UsageError, match='must be true or false'):
-        parser.parse_args(['--takeover=maybe'])

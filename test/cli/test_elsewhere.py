@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.cli.main import COMMANDS
+
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,12 +70,14 @@ AS_IT_IS = pytest.param(('-m', 'psd_deflection'), id='as it is')
 
 @pytest.mark.parametrize('way', [WITHOUT, AS_IT_IS])
 def test_recordings_are_made_read_and_studied(way: tuple[str, str], tmp_path: Path) -> None:
-    for step in STEPS:
+    for step in (step for step in STEPS if step[0] in COMMANDS):
         done = subprocess.run(
             [sys.executable, *way, *step], cwd=tmp_path, capture_output=True, text=True, check=False, encoding='utf-8'
         )
         assert done.returncode in ((0, 1) if '--compare' in step else (0,)), (step, done.stderr[-3000:])
-    for name in ('bag', 'again.mcap', 'run.html', 'run.png', 'found/report.html', 'calibrated/rig.yaml'):
+    of_studies = {'discover': 'found/report.html', 'calibrate': 'calibrated/rig.yaml'}
+    found = (file for command, file in of_studies.items() if command in COMMANDS)
+    for name in ('bag', 'again.mcap', 'run.html', 'run.png', *found):
         assert (tmp_path / name).exists(), name
 
 

@@ -92,3 +92,15 @@ def test_a_tip_that_does_not_move(tmp_path: Path) -> None:
     (tmp_path / 'arm.urdf').write_text(WRIST)
     with pytest.raises(ConfigError, match='no joint between base and tip moves'):
         read_arm(tmp_path / 'arm.urdf', 'd', 'c')
+
+
+@pytest.mark.parametrize('text', ['-1_0', '٣'])
+def test_a_limit_that_is_no_number_is_rejected(text: str, tmp_path: Path) -> None:
+    urdf = tmp_path / 'arm.urdf'
+    urdf.write_text(
+        '<robot name="a"><link name="base"/><link name="tool"/><joint name="j" type="revolute"><parent link="base"/>'
+        f'<child link="tool"/><axis xyz="0 0 1"/><limit lower="{text}" upper="1" velocity="1" effort="1"/>'
+        '</joint></robot>'
+    )
+    with pytest.raises(ConfigError, match='must be 1 finite number'):
+        read_arm(urdf, 'tool')

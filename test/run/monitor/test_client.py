@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.cli.main import main
+from psd_deflection.cli.main import COMMANDS, main
 from psd_deflection.records import BlockStatus
 from psd_deflection.run.monitor import client
 from psd_deflection.run.monitor.served import Served, announce, served_pages
@@ -87,6 +87,7 @@ def test_zero_waits_for_a_link_that_moves(
 CALIBRATE = ['calibrate', '--live', '--params-file', str(ROOT / 'config' / 'thesis_rig.yaml'), '--out']
 
 
+@pytest.mark.skipif('calibrate' not in COMMANDS, reason='an optional room')
 def test_calibrate_needs_the_recording_on_this_machine(
     serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

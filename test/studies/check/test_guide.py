@@ -5,15 +5,19 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import null_log, texts
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 from psd_deflection.rig.wiring import Wiring
+from psd_deflection.run.guided import run_guided
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.guide import Guide, Phase, directions
 from psd_deflection.studies.check.result import RIGHT, WRONG, Checkup, levels
@@ -315,3 +319,23 @@ def test_landmark_is_outermost_psd_along_axis() -> None:
     first, second, _ = directions(rig)
     assert first == 'Push the tip along +X (towards the PSD at x 30 mm, y -80 mm) and hold it.'
     assert second == 'Push the tip along +Y (away from the PSD at x 30 mm, y -80 mm) and hold it.'
+
+
+@pytest.mark.slow
+def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
+    logged: list[str] = []
+    shown: list[float] = []
+    world = load_rig(overrides={'psd_1.axes': ['-y', 'x'], 'psds_exchanged': True})
+    found = run_guided(load_rig(), world, texts(logged.append), lambda guide: shown.append(guide.progress))
+    assert found.verdict == WRONG
+    assert dict(found.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
+    prompts = [text[:12] for text in logged if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
+    assert prompts == ['Leave the li', '1 of 3: Push', 'Let go.', '2 of 3: Push', 'Let go.', '3 of 3: Turn', 'Let go.']
+    assert max(shown) > 0.9
+
+
+@pytest.mark.slow
+def test_a_port_where_nothing_is_is_rejected(tmp_path: Any) -> None:
+    rig = load_rig(overrides={'port': str(tmp_path / 'nothing')})
+    with pytest.raises(DeviceError, match='no such port'):
+        run_guided(rig, rig, null_log, lambda guide: None)
