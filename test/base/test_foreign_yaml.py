@@ -68,9 +68,9 @@ def readers(path: Path) -> list[type[PsdDeflectionError]]:
     budget, discover = map(
         optional, ('psd_deflection.studies.budget.inputs', 'psd_deflection.studies.discover.from_recordings')
     )
-    of_rooms: list[Callable[[Path], object]] = [budget.read_inputs] if budget else []
-    of_rooms += [lambda path: discover.read_observations([str(path)], None)] if discover else []
-    for read in (load_rig, read_information, *of_rooms):
+    known: list[Callable[[Path], object]] = [load_rig, read_information, *([budget.read_inputs] if budget else [])]
+    known += [lambda path: discover.read_observations([str(path)], None)] if discover else []
+    for read in known:
         with pytest.raises(PsdDeflectionError) as error:
             read(path)
         assert path.name in str(error.value)
