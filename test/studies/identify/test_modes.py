@@ -15,7 +15,7 @@ from blind.modes import CASES, RATE, Link, driven, rung, scored
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import from_recordings
 from psd_deflection.studies.identify.from_recordings import read_identify
-from psd_deflection.studies.identify.modes import modes_of
+from psd_deflection.studies.identify.modes import modes_of, ringing_levels
 
 
 @pytest.mark.slow
@@ -32,6 +32,16 @@ def test_intervals_hold_the_truth(name: str, frequency_off: float, damping_off: 
     frequency, damping = np.sum(score.inside, axis=0)
     assert frequency >= 9
     assert damping >= 9
+
+
+def test_ringing_is_as_loud_beside_a_steady_motion() -> None:
+    t = np.arange(1000) / RATE
+    ringing = 1e-6 * np.exp(-0.02 * 2.0 * np.pi * 14.0 * t) * np.cos(2.0 * np.pi * 14.0 * t)
+    plain, moving = (
+        ringing_levels(y, RATE, [(14.0, 0.02)], (0, 200), 500) for y in (ringing, ringing + 1e-3 * t - 2e-3)
+    )
+    np.testing.assert_allclose(moving, plain, rtol=1e-6, atol=1e-12)
+    assert plain[0, 0] > 50.0 * plain[0, 1]
 
 
 def test_noise_that_remembers_has_no_mode() -> None:
