@@ -287,6 +287,9 @@ def why_beyond(path: PurePath, column: int, seconds: float) -> str:
     if FROM_1904 + 9e8 < seconds < FROM_1904 + 2**31:
         line = awk_line(path, column, f'{{}} - {FROM_1904}')
         return f": LabVIEW's seconds since 1904 by their size; `{line}` counts from 1970"
+    if 2**31 <= seconds < 2**32:
+        line = awk_line(path, column, '{} / 1000000')
+        return f': µs of a 32-bit counter by their size; `{line}` makes seconds'
     for name, scale in TIME_UNITS[:3]:
         if 9e8 < seconds / scale < 2**31:
             return f': {name} since 1970 by their size; `{awk_line(path, column, f"{{}} / {scale:.0f}")}` makes seconds'
@@ -295,9 +298,10 @@ def why_beyond(path: PurePath, column: int, seconds: float) -> str:
 
 def why_falling(path: PurePath, column: int, line: int, before_s: float, seconds: float) -> str:
     """What a time that is not after the one before, in ``line``, probably is: ``: ...``, or ''."""
-    for wrap, words in ((WRAP_S, 'µs'), (1000 * WRAP_S, 'ms')):
+    # The last: µs that nobody has divided yet.
+    for wrap, words in ((WRAP_S, 'µs'), (1000 * WRAP_S, 'ms'), (1e6 * WRAP_S, 'µs')):
         step = (seconds - before_s) % wrap
-        if before_s - seconds > 0.4 * wrap and step < 0.01 * wrap:
+        if 0.4 * wrap < before_s - seconds <= wrap and step < 0.01 * wrap:
             offered = awk_line(path, column, f'{{}} + {wrap:.6f}', f'NR >= {line}')
             return f': a 32-bit counter of {words} began again; `{offered}` adds its 2^32 from this row on'
     return ''

@@ -56,14 +56,15 @@ UNITS = '\n' + '\t'.join(['s', *['V'] * 6])
 US = 2**32
 
 
-def counter(first: int, *, signed: bool = False) -> bytes:
-    """Seconds of a 32-bit counter of µs from ``first`` on."""
+def counter(first: int, *, signed: bool = False, raw: bool = False) -> bytes:
+    """Seconds of a 32-bit counter of µs from ``first`` on; ``raw``: the µs, under a name of their own."""
 
     def time(i: int) -> str:
         us = (first + 10_000 * i) % US
-        return f'{(us - US if signed and us >= US // 2 else us) / 1e6:.6f}'
+        us = us - US if signed and us >= US // 2 else us
+        return str(us) if raw else f'{us / 1e6:.6f}'
 
-    return table(time=time).encode()
+    return table(f't_us{HEADER[1:]}' if raw else HEADER, time=time).encode()
 
 
 CONVERTIBLE: dict[str, tuple[bytes, tuple[str, ...]]] = {
@@ -129,6 +130,11 @@ CONVERTIBLE: dict[str, tuple[bytes, tuple[str, ...]]] = {
     'bars': (table(separator='|').encode(), ('cells between bars',)),
     'wraps': (counter(US - 300_000), (':32: ', 'a 32-bit counter of µs began again')),
     'signed': (counter(US // 2 - 300_000, signed=True), (':32: ', 'a 32-bit counter of µs began again')),
+    't_us_wraps': (counter(US - 300_000, raw=True), ('t for t_us', 'µs of a 32-bit counter', 'µs began again')),
+    't_us_signed': (
+        counter(US // 2 - 300_000, signed=True, raw=True),
+        ('t for t_us', 'µs began again', 'microseconds'),
+    ),
     'epoch_ms': (table(time=lambda i: str(1_795_788_190_000 + 10 * i)).encode(), ('milliseconds since 1970',)),
     'labview_1904': (table(time=lambda i: f'{3_878_632_990 + 0.01 * i:.3f}').encode(), ('since 1904', 'from 1970')),
 }
