@@ -246,6 +246,8 @@ class Reader:
             if line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')) and not self._background:
                 self._background.append(self._start('psd-deflection estimator'))
                 self._background[-1].until(r'θ +[-+]\d')
+                # The daemon of ros2 meets it later than its first line.
+                self._to_the_end("timeout 60 bash -c 'until ros2 lifecycle nodes | grep -q /estimator; do :; done'")
             self._to_the_end(line)
 
     def _start(self, line: str) -> Program:
