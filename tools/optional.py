@@ -29,7 +29,7 @@ ROOMS = {
     'plants': ('', 'studies/discover/plant*.py studies/discover/readings.py'),
     'discover': ('discover', ''),
     'check': ('check, discover', 'run/guided.py'),
-    'calibrate': ('calibrate', 'cli/studies/_cal*.py run/bench_*.py run/test_bench_*.py'),
+    'calibrate': ('calibrate', 'cli/studies/_cal*.py run/bench_*.py run/test_bench_*.py */*/test_cal*ing.py'),
     'budget': ('budget, certificate', ''),
     'design': ('design', 'studies/s[cp]*.py studies/test_splitter.py'),
     **{name: (name, '') for name in ('identify', 'thesis', 'validate')},

@@ -16,6 +16,7 @@ import pytest
 import psd_deflection
 from msg_adapters import MARK, to_messages
 from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.cli import _many
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.conversion import Beside, convert
@@ -262,6 +263,7 @@ def test_a_part_of_a_replay_is_what_it_is_in_the_whole(
     assert found['samples'] + found['lost'] == pytest.approx(1492, abs=40)
 
 
+@pytest.mark.skipif(_many.FLEET is None, reason='an optional room')
 def test_several_recordings_are_replayed_in_the_same_part(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['replay', str(BAGS / 'clean'), str(BAGS / 'lost_samples'), '--from', '1', '--to', '2', '--json']) == 0
     assert [json.loads(line)['samples'] for line in capsys.readouterr().out.splitlines()] == [1000, 973]

@@ -17,6 +17,7 @@ import pytest
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log
+from psd_deflection.base.plugins import optional
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import RESTART, AppliedLoad, BlockStatus, Mark, ParameterChange, ReferencePose
 from psd_deflection.rig.config import load_rig
@@ -30,6 +31,8 @@ from test.heard import WAIT_S
 from .serving import BLOCK_NS, START_NS, Serving, StillShown
 
 Serve = Callable[..., Serving]
+
+KEEPS = optional('psd_deflection.run.monitor.kept_history')
 
 
 def ask(
@@ -275,6 +278,7 @@ def column(answer: dict[str, Any], name: str) -> list[float]:
     return [float(v) for v in np.frombuffer(base64.b64decode(answer['columns'][name]), '<f4')]
 
 
+@pytest.mark.skipif(not KEEPS, reason='an optional room')
 def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> None:
     serving = serve()
     serving.give(0, 100)
@@ -302,6 +306,7 @@ def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> No
     assert column(history_of(serving, 40.0, points=10), 'blocks') == [156]
 
 
+@pytest.mark.skipif(not KEEPS, reason='an optional room')
 @pytest.mark.parametrize(
     ('query', 'headers', 'status', 'words'),
     [
