@@ -230,6 +230,7 @@ def test_answer_of_window_equals_that_of_cut_file(
     assert of_the_part != of_all
 
 
+@pytest.mark.skipif('calibrate' not in COMMANDS, reason='an optional room')
 def test_what_is_computed_from_a_part_says_which(two_files: tuple[Path, Path]) -> None:
     full = psd_deflection.open(two_files[0])
     assert full.crop(0.5, 5.5).name == 'whole.csv, from 0.5 s to 5.5 s'

@@ -77,6 +77,10 @@ def test_a_file_of_another_name_is_known_by_its_content(tmp_path: Path) -> None:
     sink.close()
     other = (tmp_path / 'a.mcap').rename(tmp_path / 'a.backup')
     assert len(pd.open(other).samples) == SAMPLES
+
+
+@pytest.mark.skipif('rerun' not in FORMATS, reason='an optional room')
+def test_a_format_without_references_takes_none(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='does not take the poses of a camera'):
         open_reference_file(tmp_path / 'a.rrd')
 
