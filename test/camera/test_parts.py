@@ -28,7 +28,6 @@ from psd_deflection.camera.rim_model import PosePrior, Shape, expected, moved, r
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.camera.target import target_of
 from psd_deflection.records import FloatArray
-from test.altered import altered
 
 
 def segment(marker: int, body: bytes) -> bytes:
@@ -216,10 +215,10 @@ def test_covariance_has_a_second_tilt_that_is_as_likely(
     apart: float, alike: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half of the antisymmetric part of a turn is its sine about its axis; by 30 the log likelihoods are told apart."""
-    best = altered(target(np.array([0.2, -0.1, 0.0]), np.array([0.01, 0.02, 0.5]), np.zeros(0), 1), residuals=100)
-    best = altered(best, points=np.array([[80.3, 60.1], [80.3, 110.1], [80.3, 160.1]]))
+    best = target(np.array([0.2, -0.1, 0.0]), np.array([0.01, 0.02, 0.5]), np.zeros(0), 1)._replace(residuals=100)
+    best = best._replace(points=np.array([[80.3, 60.1], [80.3, 110.1], [80.3, 160.1]]))
     turn, shift = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 2e-3, -1e-3])
-    other = altered(shifted(best, np.concatenate([turn, shift])), cost=apart / 100.0)
+    other = shifted(best, np.concatenate([turn, shift]))._replace(cost=apart / 100.0)
     fits = iter([other, best])
     monkeypatch.setattr(discs, 'Fitter', lambda *_: SimpleNamespace(fit=lambda *_: next(fits)))
     lens = Lens(np.array([[1000.0, 0.0, 150.0], [0.0, 1000.0, 100.0], [0.0, 0.0, 1.0]]), np.zeros(0))
@@ -349,7 +348,7 @@ def target(turn: FloatArray, place: FloatArray, keystone: FloatArray, seed: int)
 def shifted(pose: TargetPose, by: FloatArray) -> TargetPose:
     """The pose after a small turn about its own axes, a shift, and a change of its keystone."""
     rotation = pose.rotation @ Rotation.from_rotvec(by[:3]).as_matrix()
-    return altered(pose, rotation=rotation, place=pose.place + by[3:6], keystone=pose.keystone + by[6:])
+    return pose._replace(rotation=rotation, place=pose.place + by[3:6], keystone=pose.keystone + by[6:])
 
 
 @pytest.mark.parametrize('keystone', [[], [0.2, -0.1]], ids=['with a lens', 'without'])
@@ -390,5 +389,5 @@ def test_turns_and_tilts_are_those_of_one_rotation_in_its_order() -> None:
     rest = target(np.array([0.2, -0.3, 0.4]), np.array([0.01, 0.02, 0.7]), np.zeros(0), 1)
     own = Rotation.from_euler('YXZ', [0.05, -0.04, 0.3]).as_matrix()
     place = rest.place + rest.rotation @ [1e-3, -2e-3, 3e-3]
-    found = relative(rest, altered(rest, rotation=rest.rotation @ own, place=place))
+    found = relative(rest, rest._replace(rotation=rest.rotation @ own, place=place))
     np.testing.assert_allclose(found, [1e-3, -2e-3, 0.3, -0.04, 0.05], atol=1e-12)

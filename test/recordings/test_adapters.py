@@ -55,7 +55,6 @@ from psd_deflection.records import (
     TipMotion,
     channel_names,
 )
-from test.altered import altered
 
 from .making import T0, block, estimate, run, spots
 
@@ -379,7 +378,7 @@ def test_end_effector_has_full_pose_in_chain_frame() -> None:
 def test_a_vector_of_two_or_four_numbers_is_rejected() -> None:
     e = EndEffectorDeflection(T0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3, 0.9), (0.0,) * 36)
     for numbers in ((1.0, 2.0), (1.0,) * 5):
-        for wrong in (altered(e, position=numbers), altered(e, quaternion=numbers)):
+        for wrong in (e._replace(position=numbers), e._replace(quaternion=numbers)):
             with pytest.raises(ValueError, match='zip'):
                 pose_with_covariance_stamped.from_end_effector(wrong, 'arm')
         for base in (BaseAcceleration(T0, numbers, (0.0,) * 3), BaseAcceleration(T0, (0.0,) * 3, numbers)):

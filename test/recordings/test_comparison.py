@@ -16,7 +16,6 @@ from psd_deflection.recordings.provenance import NAMES, differences, provenance
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.comparison import agree
 from psd_deflection.recordings.write import bag_writer
-from test.altered import altered
 
 POSE = {'position': {'x': 1e-3, 'y': -2e-3, 'z': 0.0}, 'orientation': {'x': 0.0, 'y': 0.0, 'z': 1e-3, 'w': 1.0}}
 
@@ -76,7 +75,7 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     from psd_deflection.model.solvers.exact import ExactSolver
 
     solve = ExactSolver.solve
-    monkeypatch.setattr(ExactSolver, 'solve', lambda *a: altered((s := solve(*a)), dx=s.dx * (1.0 + share)))
+    monkeypatch.setattr(ExactSolver, 'solve', lambda *a: (s := solve(*a))._replace(dx=s.dx * (1.0 + share)))
 
 
 OLD = {'psd_deflection': '0.0.9', 'numpy': '1.25.0'}

@@ -26,7 +26,6 @@ from psd_deflection.records import (
     TemperatureReading,
     TipLoad,
 )
-from test.altered import altered
 
 from .making import STEP, T0, block, estimate
 
@@ -235,7 +234,7 @@ def test_no_text_ends_in_a_traceback(tmp_path: Path, junk: str, where: int) -> N
 
 
 def other(e: DeflectionEstimate, solver: str, dx: float) -> DeflectionEstimate:
-    return altered(e, solver=solver, dx=dx, primary=False)
+    return e._replace(solver=solver, dx=dx, primary=False)
 
 
 def test_estimates_have_one_row_a_block(tmp_path: Path) -> None:
@@ -245,7 +244,7 @@ def test_estimates_have_one_row_a_block(tmp_path: Path) -> None:
     sink.put(TipLoad(estimate(0).t_ns, 1.5, -2.5, 0.125))
     sink.put(other(estimate(0), 'wls', 0.25))
     sink.put(TipLoad(estimate(2).t_ns, 9.0, 9.0, 9.0))
-    sink.put(altered(estimate(3), chi_square=1.25))
+    sink.put(estimate(3)._replace(chi_square=1.25))
     sink.put(other(estimate(4), 'wls', 0.5))
     sink.close()
     sink.close()

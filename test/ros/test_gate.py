@@ -18,7 +18,6 @@ from psd_deflection.base.log import INFO, WARNING
 from psd_deflection.ros.endpoints import qos
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate, frame_fault, quaternion_fault, stamp_fault
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic
-from test.altered import altered
 from test.ros.test_conformance import nodes_of_setup
 
 pytestmark = pytest.mark.ros
@@ -133,7 +132,7 @@ def test_a_volatile_publisher_gets_no_latched_subscription(
     """DDS would warn it of messages that do not come, while they do. One that keeps its message is heard, however late
     the gate listens."""
     row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', Delivery(1))
-    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row, altered(row, delivery=LATCHED)))
+    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row, row._replace(delivery=LATCHED)))
     warned: list[Any] = []
     publisher = peer.node.create_publisher(
         String, TOPIC, 1, event_callbacks=PublisherEventCallbacks(incompatible_qos=warned.append)

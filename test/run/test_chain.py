@@ -16,7 +16,6 @@ from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import null_log, texts
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.run.chain import ChainSession, Composed
-from test.altered import altered
 from test.heard import WAIT_S
 from test.run.conftest import ScriptedDevice
 
@@ -100,7 +99,7 @@ def test_one_end_effector_is_composed_at_a_time(running: Running, file: ChainFil
     first = running.chain.sessions[0].pipeline.last_estimate
     running.chain.close()
     assert first is not None
-    second = altered(first, t_ns=first.t_ns + 20_000_000)
+    second = first._replace(t_ns=first.t_ns + 20_000_000)
     chain = ChainSession(file, null_log)
     inside, go_on, composed = threading.Event(), threading.Event(), []
 
@@ -134,7 +133,7 @@ def test_a_link_that_is_away_is_missing_and_named(running: Running, devices: lis
     assert upper is not None
     # The stamps of what would come from the other device, without waiting for them.
     for block in range(1, 2 * PATIENCE):
-        running.chain.take(0, altered(upper, t_ns=last.t_ns + 10**9 + block * 20_000_000))
+        running.chain.take(0, upper._replace(t_ns=last.t_ns + 10**9 + block * 20_000_000))
     one = running.until(lambda c: c.end is None)
     assert one.why == 'fore: no estimate'
     assert one.as_record() is None

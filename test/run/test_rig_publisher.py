@@ -20,7 +20,6 @@ from psd_deflection.records import RawChunk, Record
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.rig_publisher import RigPublisher
-from test.altered import altered
 from test.late import Heard, written
 
 MODAL = {'filter': 'modal', 'degraded': 'hold', 'solvers': ['exact', 'wls']}
@@ -69,8 +68,8 @@ class Running:
     def from_message(self, number: int) -> list[Heard]:
         """What a recorder has that joins then: the latched message and all that follow."""
         latched = [m for m in self.heard[:number] if m.topic == RIG][-1:]
-        later = [altered(m, topic='/arm' + m.topic) for m in (*latched, *self.heard[number:])]
-        return [altered(m, t_ns=max(m.t_ns, self.heard[number].t_ns)) for m in later]
+        later = [m._replace(topic='/arm' + m.topic) for m in (*latched, *self.heard[number:])]
+        return [m._replace(t_ns=max(m.t_ns, self.heard[number].t_ns)) for m in later]
 
 
 def chunks(rig: Rig, first: int) -> Iterator[RawChunk]:

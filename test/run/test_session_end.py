@@ -32,7 +32,6 @@ from psd_deflection.run.headless import run_headless, run_until_signal
 from psd_deflection.run.monitor.start import start_views
 from psd_deflection.run.realtime import Signals, StopRequestedError
 from psd_deflection.run.session import Session
-from test.altered import altered
 from test.heard import WAIT_S, until
 
 ALLOWED_S = 2.0
@@ -167,7 +166,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
-    full = altered(usage, free=0)
+    full = usage._replace(free=0)
     monkeypatch.setattr(recorder, 'CHECK_EVERY', 20)
     monkeypatch.setattr(shutil, 'disk_usage', lambda _: full if sent else usage)
     sent: list[SampleFrame] = []

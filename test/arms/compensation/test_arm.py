@@ -10,7 +10,6 @@ import pytest
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.arm import read_arm, read_limits
 from psd_deflection.base.errors import ConfigError
-from test.altered import altered
 
 URDF = Path(__file__).parents[3] / 'config' / 'two_links.urdf'
 EXAMPLE = Path(__file__).parents[3] / 'config' / 'two_links.yaml'
@@ -44,7 +43,7 @@ def test_the_jacobian_is_the_derivative(tmp_path: Path, base: str) -> None:
     jacobian, at, h = arm.jacobian(q), arm.pose(q), 1e-6
     for n in range(len(q)):
         moved = arm.pose(q + h * np.eye(len(q))[n])
-        rotated = altered(moved, rotation=moved.rotation @ at.rotation.T).rotation_vector
+        rotated = moved._replace(rotation=moved.rotation @ at.rotation.T).rotation_vector
         assert jacobian[:, n] == pytest.approx(np.concatenate([moved.position - at.position, rotated]) / h, abs=1e-5)
 
 

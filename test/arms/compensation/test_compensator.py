@@ -21,7 +21,6 @@ from psd_deflection.arms.compensation.response import JointResponse
 from psd_deflection.arms.compensation.settings import CompensatorSettings, ShaperSettings
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
-from test.altered import altered
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parents[2] / 'config' / 'two_links.yaml'
@@ -179,7 +178,7 @@ def reporting(arm: Arm) -> Loop:
 
 
 def observed(loop: Loop, **changed: object) -> Observed:
-    return altered(Observed(loop.t, loop.plant.end().deflection, CERTAIN), **changed)
+    return Observed(loop.t, loop.plant.end().deflection, CERTAIN)._replace(**changed)  # type: ignore[arg-type]
 
 
 NAN = shift(math.nan, 0.0, 0.0)

@@ -34,7 +34,6 @@ from psd_deflection.devices.protocol.frames import (
 from psd_deflection.devices.protocol.text_lines import Description, parse, positive
 from psd_deflection.devices.protocol.words import MAX_TEXT, device_words, finite
 from psd_deflection.records import MOST_PSDS
-from test.altered import altered
 
 SAMPLE = SampleFrame(0, 1, 1000, (1, -1, 16384, 0, 0, 16384))
 SAMPLE_BYTES = bytes.fromhex('020102010101 03e803 01010101 01 0201 03ffff 0240 01010101 0640713ed6b200')
@@ -121,9 +120,9 @@ def test_bytes_that_are_no_frame(label: str, encoded: str, reason: BadReason) ->
 
 @pytest.mark.parametrize('wide', [False, True])
 def test_a_device_time_of_285_years_is_the_latest(wide: bool) -> None:
-    latest = altered(SAMPLE, t_device_us=2**53)
+    latest = SAMPLE._replace(t_device_us=2**53)
     assert decode(encode(latest, wide=wide)) == [latest]
-    (bad,) = decode(encode(altered(SAMPLE, t_device_us=2**53 + 1), wide=wide))
+    (bad,) = decode(encode(SAMPLE._replace(t_device_us=2**53 + 1), wide=wide))
     assert isinstance(bad, BadFrame)
     assert bad.reason == BadReason.BODY
 
@@ -171,7 +170,7 @@ def test_a_hello_of_512_bytes_encoded_is_sent_and_received() -> None:
 
 def test_a_field_that_does_not_fit_is_rejected() -> None:
     with pytest.raises(ValueError, match='SampleFrame'):
-        encode(altered(SAMPLE, seq=1 << 32))
+        encode(SAMPLE._replace(seq=1 << 32))
 
 
 samples = st.builds(

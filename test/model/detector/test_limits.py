@@ -13,7 +13,6 @@ from psd_deflection.measure.averaging import BlockMeasures, measured
 from psd_deflection.measure.health import Loudness, OpticsHealth, Verdict
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock
 from psd_deflection.rig.config import load_rig
-from test.altered import altered
 
 STEP = 10.0 / 32768
 GOOD = (0.5, -0.5, 5.0, 0.25, -0.25, 5.0)
@@ -23,7 +22,7 @@ DOTS = (2.5e-4, -2.5e-4, 1.25e-4, -1.25e-4)
 def of(volts: npt.NDArray[np.float32], dots: tuple[float, ...] = ()) -> BlockMeasures:
     """The measures of a block with these ``dots`` as its means."""
     samples = np.zeros((len(volts), volts.shape[1] // 3 * 2))
-    return altered(measured([volts.astype(np.float32)], [samples])[0], means=dots)
+    return measured([volts.astype(np.float32)], [samples])[0]._replace(means=dots)
 
 
 def classify(

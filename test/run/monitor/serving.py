@@ -17,7 +17,6 @@ from psd_deflection.run.monitor.feed import Feed
 from psd_deflection.run.monitor.metrics import Family, counter
 from psd_deflection.run.monitor.server import MonitorServer
 from psd_deflection.run.monitor.shown import RejectedError
-from test.altered import altered
 from test.heard import until
 
 START_NS = 1_700_000_000_000_000_000
@@ -151,7 +150,7 @@ class Serving:
         for index in range(first, first + count):
             t_ns = START_NS + index * every * BLOCK_NS
             if options.get('status', BlockStatus.OK) is BlockStatus.OK:
-                self.feed.put(altered(estimate_of(index, scale=scale), t_ns=t_ns))
+                self.feed.put(estimate_of(index, scale=scale)._replace(t_ns=t_ns))
             self.feed.put(dataclasses.replace(spots_of(index, **options), t_ns=t_ns))
 
     def settle(self) -> None:

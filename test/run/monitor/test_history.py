@@ -17,7 +17,6 @@ from psd_deflection.records import BlockStatus
 from psd_deflection.run.monitor import history
 from psd_deflection.run.monitor.feed import BlockResult
 from psd_deflection.run.monitor.history import LEVELS, AskedError, History, Window, asked
-from test.altered import altered
 
 from .serving import START_NS, estimate_of, spots_of
 
@@ -30,7 +29,7 @@ def row(t_ns: int, dx: float | None, total: float = 5.0, lost: int = 0, gone: in
     """A block at ``t_ns`` whose dX is ``dx`` (None: it has no estimate), and whose first sum is ``total``."""
     status = BlockStatus.OK if dx is not None else BlockStatus.LASER_LOST
     spots = dataclasses.replace(spots_of(0, status=status, lost=lost), t_ns=t_ns, sums=(total, 5.0))
-    return BlockResult(spots, altered(estimate_of(0), t_ns=t_ns, dx=dx) if dx is not None else None, gone)
+    return BlockResult(spots, estimate_of(0)._replace(t_ns=t_ns, dx=dx) if dx is not None else None, gone)
 
 
 def filled(rows: Iterable[BlockResult], levels: tuple[tuple[int, int], ...] = LEVELS) -> History:

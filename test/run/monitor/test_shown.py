@@ -31,7 +31,6 @@ from psd_deflection.records import (
 from psd_deflection.run.monitor.feed import COLUMNS, BlockResult, Feed, row_columns, row_json
 from psd_deflection.run.monitor.shown import RejectedError
 from psd_deflection.run.monitor.shown_recording import ShownRecording
-from test.altered import altered
 
 from .serving import START_NS, estimate_of, spots_of
 
@@ -188,7 +187,7 @@ def test_a_row_has_the_block_and_its_primary_estimate() -> None:
     feed = Feed()
     feed.put(estimate_of(7))
     feed.put(TipLoad(0, 0.0, 0.0, 0.0))
-    feed.put(altered(estimate_of(7, primary=False), dx=9.0))
+    feed.put(estimate_of(7, primary=False)._replace(dx=9.0))
     feed.put(spots_of(7, lost=3))
     (result,) = feed.take()
     assert isinstance(result, BlockResult)

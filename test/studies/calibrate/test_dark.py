@@ -16,7 +16,6 @@ from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import dark_levels, result_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.observation import CalibrationRun
-from test.altered import altered
 
 RATE = 1000
 LIT = misaligned.Light(0.12, 3.0, -2.0, 0.0, 0.0, 0.0)
@@ -194,7 +193,7 @@ def test_estimates_are_free_of_light_and_of_offsets(nominal: Rig) -> None:
 
     Offsets of x and y of 20 mV (10 µm) go with the zero.
     """
-    light = (altered(LIT, offset_x=0.02), altered(DIM, offset_y=-0.02))
+    light = (LIT._replace(offset_x=0.02), DIM._replace(offset_y=-0.02))
     rig = campaign.darkened(nominal, light, np.random.default_rng(1))
     before, after = lit_poses(nominal, light, 5), lit_poses(rig, light, 5)
     assert before > 30e-6

@@ -24,7 +24,6 @@ from psd_deflection.studies.validate import from_recordings as module
 from psd_deflection.studies.validate.clock import Motion
 from psd_deflection.studies.validate.from_recordings import ValidateProblem, read_validate
 from psd_deflection.studies.validate.validate import validate
-from test.altered import altered
 
 LATE = 0.0123
 """s, by which the stamps of the reference are early."""
@@ -215,7 +214,7 @@ def test_of_all_solvers_those_that_can_are_compared(run: Opened) -> None:
     with pytest.raises(ConfigError, match='bean'):
         read_validate(run, solvers=['bean'])
     # Both centres on one line through the middle.
-    inline = altered(run, rig=load_rig(overrides={'psd_2.center': [0.0, -0.07]}))
+    inline = run._replace(rig=load_rig(overrides={'psd_2.center': [0.0, -0.07]}))
     assert 'appendix_d' not in read_validate(inline, solvers=['all']).solvers
     for solvers in (['appendix_d'], ['all', 'appendix_d']):
         with pytest.raises(SolverError, match='appendix_d divides by both'):
