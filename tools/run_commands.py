@@ -39,7 +39,7 @@ TOOLS: dict[str, list[str]] = _TABLES['tools']
 ADMINISTRATION = re.compile(
     r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|source|ssh|sudo|systemctl|udevadm|useradd) '
 )
-"""Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
+"""Lines for root or for another machine: never typed here. test/docs/test_docs.py checks the files they install."""
 
 HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says nothing: never run here.
 

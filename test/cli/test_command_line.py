@@ -1,12 +1,14 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: help that teaches, options, completion, and one clear line for what goes wrong."""
+"""The command line: help that teaches, options, completion, effects, one clear line for what goes wrong."""
 
 import argparse
 import json
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,11 @@ import pytest
 from psd_deflection.base.errors import EXIT_STATUSES
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.cli.params import NEEDED
+from psd_deflection.cli.run.estimator import simulates_at_once
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run import simulated_rig
+from psd_deflection.run.simulated_rig import SimulatedRigProcess, started_early
 
 ROOT = Path(__file__).parent.parent.parent
 BAGS = ROOT / 'bags'
@@ -141,3 +148,85 @@ def test_its_examples_run(
             continue
         # A recording of another machine may differ in its last bits.
         assert main(argv) in ((0, 1) if '--compare' in argv else (0,)), line
+
+
+def test_the_list_has_every_effect(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['effects']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name, effect in catalogue().items():
+        assert [line for line in lines if line.startswith(name + ' ') and effect.summary in line]
+
+
+@pytest.mark.parametrize('name', catalogue())
+def test_an_effect_is_explained_with_a_command_that_runs(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(['effects', name]) == 0
+    text = capsys.readouterr().out
+    effect = catalogue()[name]
+    assert effect.equation in text
+    for p in effect.parameters:
+        assert f'{p.name}: {p.description}' in text
+    command = next(line.split('psd-deflection ')[1] for line in text.splitlines() if line.startswith('  try'))
+    words = shlex.split(command)
+    words[words.index('--out') + 1] = str(tmp_path / 'run.csv')
+    words[words.index('--loads') + 1] = 'constant:0,-50,0:0.1'
+    assert main(words) == 0
+    assert name in capsys.readouterr().out
+
+
+def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['effects', 'sensor_rotation', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)['sensor_rotation']
+    assert found['corrected'] == 'reading'
+    assert found['parameters']['angle']['unit'] == 'rad'
+    assert found['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_wrong_name_is_reported_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['effects', 'sensor_rotatoin']) == 2
+    assert 'did you mean sensor_rotation' in capsys.readouterr().err
+
+
+# Nothing else shows a process that nobody has taken yet.
+WAITING = simulated_rig._waiting
+
+
+@pytest.mark.parametrize(
+    ('overrides', 'ros_arguments', 'wanted'),
+    [
+        ({}, (), True),
+        ({'source': 'dataq'}, ('--ros-args', '-p', 'record:=true'), True),
+        ({'port': '/dev/ttyACM0'}, (), False),
+        ({'source': 'replay'}, (), False),
+        ({'source': 'nonsense'}, (), False),
+        ({}, ('--ros-args', '-p', 'port:=/dev/ttyACM0'), False),
+        ({}, ('--ros-args', '--params-file', 'rig.yaml'), False),
+    ],
+)
+def test_it_is_started_where_no_port_is_known(
+    overrides: dict[str, object], ros_arguments: tuple[str, ...], wanted: bool
+) -> None:
+    assert simulates_at_once(overrides, ros_arguments) is wanted
+
+
+def test_early_rig_is_taken_by_first_user_or_closed() -> None:
+    with started_early(True):
+        (process,) = WAITING
+        rig = SimulatedRigProcess(load_rig())
+        assert rig.port.startswith('/dev/')
+        assert WAITING == []
+        assert process.poll() is None
+        rig.close()
+        assert process.poll() is not None
+    with started_early(True):
+        (unused,) = WAITING
+    assert unused.poll() is not None
+    with started_early(False):
+        assert WAITING == []
+
+
+def test_it_ends_without_a_word_when_its_daemon_is_gone_before() -> None:
+    command = [sys.executable, '-m', 'psd_deflection.devices.serve']
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')

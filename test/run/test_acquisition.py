@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The reader against a device whose every byte the test writes."""
+"""The reader against a device whose every byte the test writes; pings, when they are due and whose answer counts."""
 
 import itertools
 import queue
@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -19,12 +20,13 @@ from psd_deflection.base.log import INFO, WARNING, null_log, texts
 from psd_deflection.devices import contract_frames, port_source
 from psd_deflection.devices.ports import SerialPort
 from psd_deflection.devices.protocol.frames import HelloFrame, PongFrame, SampleFrame, encode
-from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
+from psd_deflection.devices.source import Clock, Event, PortClosedError, Received, Sample, Source, SourceEndedError
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, RESTART
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run import acquisition as module
 from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.arrivals import Annotation, Arrival, Ended, Item, Restarted
+from psd_deflection.run.hello import PING_S, UNANSWERED, Pinger
 from test.heard import WAIT_S
 
 pytestmark = pytest.mark.slow
@@ -534,3 +536,70 @@ def test_a_ping_is_answered_and_bounds_the_delay(monkeypatch: pytest.MonkeyPatch
     # The last one was asked when nothing more came.
     assert (acquisition.counters.pings, acquisition.counters.pongs) == (30, 29)
     assert acquisition.clock_state().round_trip_ns == 500_000_000
+
+
+@pytest.fixture
+def asked_source() -> Mock:
+    made = Mock(spec=Source)
+    made.ping.return_value = True
+    return made
+
+
+def cookie_of(asked_source: Mock) -> int:
+    (cookie,) = asked_source.ping.call_args.args
+    return int(cookie)
+
+
+def test_one_is_due_at_once_and_the_next_at_a_random_time(asked_source: Mock) -> None:
+    waits = []
+    for _ in range(50):
+        pinger = Pinger()
+        assert pinger.is_due(0.0)
+        assert pinger.ask(asked_source, 10.0, 0)
+        assert not pinger.is_due(10.0 + 0.99 * PING_S[0])
+        assert pinger.is_due(10.0 + 1.01 * PING_S[1])
+        waits.append(next(k for k in range(1000) if pinger.is_due(10.0 + k * 1e-3)))
+    assert len(set(waits)) > 10
+
+
+def test_late_answer_returns_send_time_of_question(asked_source: Mock) -> None:
+    pinger = Pinger()
+    pinger.ask(asked_source, 0.0, 111)
+    first = cookie_of(asked_source)
+    pinger.ask(asked_source, 1.0, 222)
+    # Seconds late: how late the line is.
+    assert pinger.answered(first) == 111
+    assert pinger.answered(first) is None
+    assert pinger.answered(cookie_of(asked_source)) == 222
+    assert pinger.answered(cookie_of(asked_source)) is None
+    assert pinger.answered(0) is None
+
+
+def test_device_with_unanswered_pings_is_asked_no_more(asked_source: Mock) -> None:
+    pinger = Pinger()
+    for k in range(UNANSWERED):
+        assert pinger.is_due(float(k))
+        pinger.ask(asked_source, float(k), k)
+    assert not pinger.is_due(1e9)
+
+
+def test_one_answer_makes_up_for_those_before(asked_source: Mock) -> None:
+    pinger = Pinger()
+    for k in range(UNANSWERED - 1):
+        pinger.ask(asked_source, float(k), k)
+    assert pinger.answered(cookie_of(asked_source)) is not None
+    pinger.ask(asked_source, 100.0, 0)
+    assert pinger.is_due(200.0)
+
+
+def test_a_source_that_cannot_be_asked_is_asked_once(asked_source: Mock) -> None:
+    asked_source.ping.return_value = False
+    pinger = Pinger()
+    assert not pinger.ask(asked_source, 0.0, 0)
+    assert not pinger.is_due(1e9)
+
+
+def test_a_port_that_goes_away_meanwhile_is_the_callers_to_see(asked_source: Mock) -> None:
+    asked_source.ping.side_effect = PortClosedError('gone')
+    with pytest.raises(PortClosedError):
+        Pinger().ask(asked_source, 0.0, 0)

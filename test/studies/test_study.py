@@ -27,7 +27,7 @@ from psd_deflection.studies.discover.loop import LoopResult
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 from psd_deflection.studies.watch.result import WatchedRun
-from test.studies.discover.test_laws import Spring
+from test.studies.discover.test_discover import Spring
 
 # About every 50 ms, so that every stretch that is shown has one.
 MARKS = [Mark(t_ns, f'bump {i}') for i, t_ns in enumerate(range(10_000_000, 3_600_000_000, 47_000_000))]

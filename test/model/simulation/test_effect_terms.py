@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each term of each effect on samples of any values: formulas written here from docs/simulation.md and the equations.
 
-``test_effect_formulas.py`` has whole simulations against a second generator; here one effect is called alone, at
+``test_effects.py`` has whole simulations against a second generator; here one effect is called alone, at
 two sizes and with either sign, so that no term hides behind another.
 """
 

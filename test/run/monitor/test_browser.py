@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The page in headless Chromium, before the real daemon and the simulated rig."""
+"""The page in headless Chromium, before the real daemon and the simulated rig; axe-core finds no violation in it."""
 
 import contextlib
 import http.server
@@ -20,7 +20,8 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
 from psd_deflection.cli.main import main
-from psd_deflection.records import Mark
+from psd_deflection.records import AppliedLoad, BlockStatus, Mark
+from tools.accessible import views, violations
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
 from .browsing import Page
@@ -380,3 +381,44 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
     assert page.nodes() == nodes
     assert serving.feed.dropped == 0
     assert page.complaints() == []
+
+
+def audit(page: Page, ready: str) -> None:
+    found = []
+    for view in views(page.driver):
+        page.driver.refresh()
+        page.until(ready)
+        found += [f'{view}: {line}' for line in violations(page.driver)]
+    assert found == []
+
+
+@pytest.fixture
+def shown_page(serve: Callable[..., Serving]) -> Serving:
+    serving = serve(monitor_control='off')
+    serving.shown.recordings.append('recordings/test')
+    serving.feed.put(AppliedLoad(START_NS + 10 * BLOCK_NS, 0.0, -10.0, 0.0))
+    serving.give(0, 100)
+    serving.give(100, 5, lost=3)
+    for number in range(50):
+        serving.server.notify(f'message {number}')
+    return serving
+
+
+@pytest.mark.slow
+def test_the_live_page(page: Page, shown_page: Serving) -> None:
+    page.open(shown_page.url)
+    audit(page, 'document.body.dataset.rows >= 105 && document.querySelectorAll("#entries details").length > 0')
+
+
+@pytest.mark.slow
+def test_the_live_page_with_all_that_opens(page: Page, shown_page: Serving) -> None:
+    shown_page.give(105, 1, status=BlockStatus.LASER_LOST)
+    page.open(shown_page.url)
+    for what in ('weigh', 'ask'):
+        page.until('document.querySelectorAll("#entries details").length > 0')
+        page.js('[...document.querySelectorAll("details")].forEach((d) => { d.open = true; })')
+        page.js('document.getElementById("hold").click()')
+        page.js('document.querySelector("[data-series=\'4\']").click()')
+        page.js(f'document.getElementById("{what}").showModal()')
+        assert violations(page.driver) == []
+        page.driver.refresh()

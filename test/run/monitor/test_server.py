@@ -1,34 +1,41 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The server as any client sees it: what it sends, whom it obeys, and what is said before it starts."""
+"""The server as any client sees it, Prometheus too: what it sends, whom it obeys, the calibration that it starts."""
 
 import asyncio
 import base64
 import json
+import math
 import re
 import socket
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
 import aiohttp
 import numpy as np
 import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as parsed
 
+from psd_deflection import simulate
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log
 from psd_deflection.base.plugins import optional
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm
+from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.records import RESTART, AppliedLoad, BlockStatus, Mark, ParameterChange, ReferencePose
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import server
-from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.feed import BlockResult, Feed
 from psd_deflection.run.monitor.gated import CONNECTIONS, VIEWERS, is_loopback, is_own_host, is_own_page, is_token
+from psd_deflection.run.monitor.metrics import CONTENT_TYPE, Family, counters, of_block, of_pipeline, text_of
 from psd_deflection.run.monitor.served import need_server
 from psd_deflection.run.monitor.server import MonitorServer
 from test.heard import WAIT_S
 
-from .serving import BLOCK_NS, START_NS, Serving, StillShown
+from .serving import BLOCK_NS, START_NS, Serving, StillShown, estimate_of, spots_of
 
 Serve = Callable[..., Serving]
 
@@ -509,3 +516,137 @@ def test_outdated_library_is_rejected_by_version(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr('importlib.metadata.version', lambda _: version)
     with pytest.raises(ConfigError, match=rf'needs aiohttp 3\.9 or later, {version} is installed'):
         need_server()
+
+
+def numbers(text: str) -> dict[tuple[str, ...], float]:
+    """Name and label values of each sample."""
+    return {(s.name, *s.labels.values()): s.value for family in parsed(text) for s in family.samples}
+
+
+def scraped(serving: Serving) -> dict[tuple[str, ...], float]:
+    status, text, headers = ask(f'{serving.url}metrics', 'GET')
+    assert status == 200
+    assert headers['Content-Type'] == CONTENT_TYPE
+    return numbers(text)
+
+
+def shown(serving: Serving, index: int) -> None:
+    """Wait until the page has this block."""
+    listen(serving.url, lambda m: any(r[1] == index for r in m.get('rows', [])))
+
+
+def test_a_scrape_has_counters_and_the_newest_estimate(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, 'FRESH_S', math.inf)
+    serving = serve()
+    before = scraped(serving)
+    assert before[('psd_deflection_samples_total',)] == 40.0
+    assert not any('meters' in key[0] for key in before)
+    serving.give(0, 3)
+    shown(serving, 2)
+    after = scraped(serving)
+    best = estimate_of(2)
+    assert after[('psd_deflection_deflection_meters', 'y')] == best.dy
+    assert after[('psd_deflection_deflection_sd_meters', 'x')] == pytest.approx(2e-7)
+    assert after[('psd_deflection_twist_radians',)] == best.theta
+    assert after[('psd_deflection_sum_volts', '2')] == 5.0
+    assert after[('psd_deflection_page_dropped_total',)] == 0.0
+
+
+def test_the_estimate_of_a_device_that_is_away_is_no_estimate(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, 'FRESH_S', 0.0)
+    serving = serve()
+    serving.give(0, 1)
+    shown(serving, 0)
+    assert not any('meters' in key[0] or 'volts' in key[0] for key in scraped(serving))
+
+
+@pytest.mark.parametrize(('headers', 'status'), [({'Host': 'evil.example'}, 403), ({}, 200)])
+def test_it_has_the_gate_of_the_page(serve: Serve, headers: dict[str, str], status: int) -> None:
+    url = serve().url
+    assert ask(url, 'GET', headers=headers)[0] == status
+    assert ask(f'{url}metrics', 'GET', headers=headers)[0] == status
+
+
+def test_names_types_and_units_are_those_of_openmetrics() -> None:
+    pipeline = Pipeline(load_rig())
+    families: list[Any] = list(parsed(text_of([*of_pipeline(pipeline), *of_block(BlockResult(spots_of(1), None))])))
+    types = {family.name: (family.type, family.unit) for family in families}
+    assert types['psd_deflection_blocks'] == ('counter', '')
+    assert types['psd_deflection_sum_volts'] == ('gauge', 'volts')
+    assert types['psd_deflection_build'] == ('info', '')
+    assert all(family.documentation for family in families)
+
+
+def test_words_of_a_device_cannot_break_the_text() -> None:
+    words = 'a "quoted" \\ word\nof two lines'
+    text = text_of([counters('samples_lost', 'cause', 'Lost', {words: 3, '\udce9': 1})])
+    found = numbers(text)
+    assert found[('psd_deflection_samples_lost_total', words)] == 3.0
+    assert found[('psd_deflection_samples_lost_total', '?')] == 1.0
+
+
+def test_a_number_that_is_none_is_reported_as_one() -> None:
+    text = text_of([Family('sum_volts', 'gauge', 'Sum', (({}, math.nan), ({'psd': '1'}, math.inf)), 'volts')])
+    values = list(numbers(text).values())
+    assert math.isnan(values[1])
+    assert values[2] == math.inf
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """A recording with a reference, as if it were being written."""
+    folder = tmp_path / 'bag'
+    made = simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29), (-40, 40, 20)], seconds=1, seed=4)
+    convert(made, folder, made.parameters, Beside.of(made), made.blocks())
+    return folder
+
+
+def calibrations(url: str, until: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """What the page is told of the calibration, as soon as ``until`` accepts it."""
+
+    def accepted(message: dict[str, Any]) -> bool:
+        found = (message.get('health') or {}).get('calibration')
+        return found is not None and until(found)
+
+    last: dict[str, Any] = listen(url, accepted)[-1]['health']['calibration']
+    return last
+
+
+def asked(url: str, wanted: object) -> tuple[int, str]:
+    status, text, _ = ask(url + 'api/calibrate', body={'calibrate': wanted})
+    return status, json.loads(text)['message']
+
+
+def test_it_shows_what_is_determined_and_ends_with_its_files(serve: Serve, bag: Path, tmp_path: Path) -> None:
+    serving = serve(bag_dir=str(tmp_path / 'made'))
+    serving.shown.folder = str(bag)
+    assert asked(serving.url, True) == (200, 'calibrating: zero the unloaded link, then hang known loads and note each')
+    assert asked(serving.url, True) == (409, 'a calibration runs already')
+    found = calibrations(serving.url, lambda c: 'parameters' in c)
+    assert found['running']
+    assert found['kind'] == 'reference'
+    assert 0 < found['determined'] < len(found['parameters'])
+    assert 1 <= len(found['needs']) <= 4
+    assert {'name', 'words', 'value', 'filled', 'determined'} <= set(found['parameters'][0])
+    status, words = asked(serving.url, False)
+    assert (status, words) == (200, f'the calibration ends; its files: {found["out"]}')
+    ended = calibrations(serving.url, lambda c: not c['running'])
+    assert ended['last'] == 'calibrated'
+    assert {path.name for path in Path(ended['out']).iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
+    assert serving.shown.recordings == [str(bag), None]
+    assert asked(serving.url, False) == (409, 'no calibration runs')
+
+
+def test_why_it_could_not_is_reported(serve: Serve, tmp_path: Path) -> None:
+    serving = serve(bag_dir=str(tmp_path))
+    assert asked(serving.url, True)[0] == 200
+    ended = calibrations(serving.url, lambda c: not c['running'])
+    assert 'recordings/test: is not on this machine' in ended['last']
+
+
+def test_a_played_recording_and_nonsense_are_rejected(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    serving = serve()
+    assert asked(serving.url, 1) == (400, 'rejected: expected {"calibrate": true} or {"calibrate": false}')
+    described = {'kind': 'replay', 'name': 'test', 'recording': None}
+    monkeypatch.setattr(serving.shown, 'describe', lambda: described)
+    assert asked(serving.url, True) == (409, 'a recording is played; psd-deflection calibrate takes it')

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration against rigs of the second generator in blind/, whose optics are not ours."""
+"""Calibration against rigs of the second generator in blind/; dark levels against photocurrents that add."""
 
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,12 +10,14 @@ import pytest
 
 from blind import calibration as campaign
 from blind import misaligned
-from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate import calibrate as module
 from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
+from psd_deflection.studies.calibrate.dark import dark_levels, result_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, prior_of_rig
 from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows
 from psd_deflection.studies.calibrate.result import values_of
@@ -228,3 +230,182 @@ def test_contradicted_priors_widen_once_worst_first(nominal: Rig, monkeypatch: p
     sd = prior.sd.copy()
     sd[[worst, next_one]] *= module.WIDER
     assert wider.sd == pytest.approx(sd)
+
+
+RATE = 1000
+LIT = misaligned.Light(0.12, 3.0, -2.0, 0.0, 0.0, 0.0)
+DIM = misaligned.Light(0.06, -1.0, 0.5, 0.0, 0.0, 0.0)
+
+
+def run_of(volts: FloatArray, name: str = 'off.csv') -> CalibrationRun:
+    return CalibrationRun(name, np.arange(len(volts)) / RATE, volts, np.zeros(0), np.zeros((0, 3)), digest='ab' * 32)
+
+
+def darkness(seconds: float = 5.0, seed: int = 1, light: tuple[Any, Any] = (LIT, DIM)) -> FloatArray:
+    return np.array(misaligned.darkness(light, seconds, np.random.default_rng(seed)))
+
+
+def white(levels: tuple[float, ...], n: int = 5000, sigma: float = 2e-3) -> FloatArray:
+    return np.array(levels) + np.random.default_rng(2).normal(0.0, sigma, (n, 6))
+
+
+def test_levels_are_within_what_is_reported_of_them_in_95_of_100(nominal: Rig) -> None:
+    """Coloured noise and flicker: the error of white noise would be a third of that."""
+    rng = np.random.default_rng(12)
+    far: list[FloatArray] = []
+    for _ in range(40):
+        light = misaligned.draw_light(rng)
+        levels = dark_levels([run_of(np.array(misaligned.darkness(light, 5.0, rng)))], nominal)
+        for one, truth in zip(levels, light, strict=True):
+            true = (truth.x + truth.offset_x, truth.y + truth.offset_y, truth.level + truth.offset_sum)
+            far.append((one.volts - true) / one.sd)
+    z = np.array(far)
+    assert 0.92 <= np.mean(np.abs(z) < 1.96) <= 0.98
+    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
+
+
+def test_the_error_of_twenty_pieces_is_students(nominal: Rig) -> None:
+    """Means that alternate by 1 mV, so that none follows from the one before."""
+    volts = np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + np.repeat(1e-3 * (-1.0) ** np.arange(20), 250)[:, None]
+    (one, _) = dark_levels([run_of(volts)], nominal)
+    assert one.sd == pytest.approx(np.full(3, 2.093024 / 1.959964 * 1e-3 / 19**0.5), rel=1e-5)
+
+
+def test_the_error_of_white_noise_is_that_of_a_mean(nominal: Rig) -> None:
+    (one, _) = dark_levels([run_of(white((1.0, 2.0, 0.1, 0.0, 0.0, 0.1), 16_000))], nominal)
+    assert one.sd == pytest.approx(np.full(3, 2e-3 / 16_000**0.5), rel=0.45)
+
+
+def test_steps_that_noise_does_not_dither_are_an_uncertainty(nominal: Rig) -> None:
+    """A steady number on a converter of 305 µV a step may be anything within the step: 88 µV rms."""
+    volts = np.tile([1.0, 2.0, 0.1, 0.0, 0.0, 0.1], (4000, 1))
+    (one, _) = dark_levels([run_of(volts)], nominal)
+    assert one.sd == pytest.approx(np.full(3, 20.0 / 65536.0 / 12.0**0.5), rel=0.01)
+
+
+def test_what_is_reported_of_one_psd(nominal: Rig) -> None:
+    lit = run_of(white((0.0, 0.0, 5.12, 0.0, 0.0, 5.06), 500, 0.0))
+    (one, two) = dark_levels([run_of(darkness())], nominal, [lit])
+    assert one.lit_sum == 5.12
+    assert one.share == pytest.approx(0.12 / 5.12, rel=4e-3)
+    assert two.share == pytest.approx(0.06 / 5.06, rel=8e-3)
+    # 0.5 mm a volt, in metres; what is left is the error of the share times half of 10 mm.
+    assert one.place == pytest.approx([1.5e-3, -1.0e-3], abs=1e-6)
+    assert one.residual == pytest.approx(5e-3 * one.sd[2] / 5.12)
+    tree = result_of_levels([one])['psd_1']
+    assert tree['sum']['value'] == one.volts[2]
+    assert (tree['sum']['file'], tree['sum']['unit']) == (0.0, 'V')
+    assert tree['recording'] == {'name': 'off.csv', 'sha256': 'ab' * 32}
+    assert words_of_level(one).startswith('psd_1 with its laser off: sum 0.119')
+    assert ' % of the light pulls to (+1.50, -1.00) mm; what ' in words_of_level(one).replace('%', ' %')
+    (alone, _) = dark_levels([run_of(darkness())], nominal)
+    assert alone.lit_sum == pytest.approx(5.0 + alone.volts[2])
+
+
+def test_lasers_may_be_off_one_after_the_other_and_for_a_part(nominal: Rig) -> None:
+    """The beam of the other laser is on: each PSD takes the longest time without its own, but for its borders."""
+    first, second = darkness(), darkness(seed=2)
+    first[:, 3:] = (0.0, 0.0, 5.0)
+    second[:, :3] = (0.0, 0.0, 5.0)
+    # While a laser goes off and comes on its light is between.
+    second[:600, 3:] = (0.0, 0.0, 5.0)
+    second[600:690, 5] = 2.0
+    second[4900:, 3:] = (0.0, 0.0, 5.0)
+    second[4850:4900, 5] = 2.0
+    (one, two) = dark_levels([run_of(first, 'a'), run_of(second, 'b')], nominal)
+    assert (one.recording, one.seconds) == ('a', 5.0)
+    assert (two.recording, two.seconds) == ('b', 4.1)
+    assert one.volts[2] == pytest.approx(0.12, abs=1e-3)
+    assert two.volts[2] == pytest.approx(0.06, abs=1e-3)
+
+
+def test_lost_samples_are_left_out(nominal: Rig) -> None:
+    volts = darkness()
+    full = dark_levels([run_of(volts)], nominal)
+    volts[1000:1500] = np.nan
+    gaps = dark_levels([run_of(volts)], nominal)
+    assert gaps[0].seconds == 4.5
+    assert np.abs(gaps[0].volts - full[0].volts).max() < 3e-4
+
+
+@pytest.mark.parametrize(
+    ('rows', 'column', 'value', 'words'),
+    [
+        (
+            slice(None),
+            5,
+            4.9,
+            r'^off\.csv: the laser of psd_2 is off for 0\.0 s; a dark level needs 4 s with sum2 below 2\.5 V '
+            r'\(sum_min\), and its median is 4\.900 V$',
+        ),
+        (slice(1500, 2600), 2, 5.0, r'the laser of psd_1 is off for 2\.3 s'),
+        (slice(700, 702), 1, 9.95, r'^off\.csv: y1 is saturated with the laser off: 9\.950 V, .*is 10 V'),
+    ],
+)
+def test_a_recording_that_reports_no_dark_level_is_rejected(
+    nominal: Rig, rows: slice, column: int, value: float, words: str
+) -> None:
+    volts = darkness()
+    volts[rows, column] = value
+    with pytest.raises(RecordingError, match=words):
+        dark_levels([run_of(volts)], nominal)
+
+
+def test_a_drift_is_rejected_if_it_moves_a_dot(nominal: Rig) -> None:
+    """2 mV of the sum are 2 µm at the edge; 2 mV of x are 1 µm of 2 % of the light."""
+    ramp = np.linspace(-1e-3, 1e-3, 5000)
+    volts = white((3.0, -2.0, 0.12, -1.0, 0.5, 0.06))
+    volts[:, 0] += ramp
+    dark_levels([run_of(volts)], nominal)
+    volts[:, 5] += ramp
+    with pytest.raises(RecordingError, match=r'sum2 drifts with the laser off: by \+[12]\.\d\d mV in 5\.0 s, noise'):
+        dark_levels([run_of(volts)], nominal)
+
+
+def test_without_light_x_and_y_mean_nothing_and_are_not_judged(nominal: Rig) -> None:
+    """A quotient of nothing may be at the rail. A sum of 0 or below is no light."""
+    volts = white((9.99, 0.0, -3e-3, 0.0, -9.99, 1e-6), sigma=1e-4)
+    levels = dark_levels([run_of(volts)], nominal)
+    assert levels[0].share == 0.0
+    assert 'no other light' in words_of_level(levels[0])
+    rig = replace_values(nominal, values_of_levels(levels[:1]))
+    sample = np.array([[1.0, 2.0, 5.0, 3.0, 4.0, 5.0]], dtype=np.float32)
+    np.testing.assert_array_equal(VoltsToDots.from_rig(rig).dots(sample), VoltsToDots.from_rig(nominal).dots(sample))
+
+
+def test_light_is_not_taken_off_twice(nominal: Rig) -> None:
+    runs = [run_of(darkness())]
+    found = replace_values(
+        nominal, {'effects.a.name': 'ambient_light', 'effects.a.psd': 1, 'effects.a.level': 0.1, 'effects.a.x': 1e-3}
+    )
+    for rejected in (lambda: dark_levels(runs, found), lambda: calibrate(runs, found)):
+        with pytest.raises(ConfigError, match=r'^effects: ambient_light.*would count it twice; take it out'):
+            rejected()
+    old = replace_values(nominal, {'calibration.names': ['psd_1.gain_x'], 'calibration.sds': [1e-3]})
+    with pytest.raises(ConfigError, match=r'^psd_1\.dark: this rig file was calibrated without it'):
+        dark_levels(runs, old)
+    dark_levels(runs, replace_values(old, {'psd_1.dark': [0.0, 0.0, 0.1], 'psd_2.dark': [0.0, 0.0, 0.1]}))
+
+
+def lit_poses(rig: Rig, light: Any, seed: int) -> float:
+    """Largest error of ΔX and ΔY, m, of the nominal rig in that light, zeroed in it."""
+    rng = np.random.default_rng(seed)
+    pose = misaligned.poses(misaligned.pushes(rng, 3, 1.0))
+    volts = misaligned.record(misaligned.nominal() | {'link.slope_ratio': 0.0}, pose, rng, light=light).volts
+    block, estimate, _ = campaign.measured(rig, volts)
+    a, b, c, d = (pose[10 + i :: 20] for i in (-2, -1, 0, 1))
+    return float(np.abs(estimate - ((9.0 * (b + c) - a - d) / 16.0)[block])[:, :2].max())
+
+
+@pytest.mark.slow
+def test_estimates_are_free_of_light_and_of_offsets(nominal: Rig) -> None:
+    """2 % of the light moves the estimate by 2 % of the deflection; with dark levels half of its noise band is left.
+
+    Offsets of x and y of 20 mV (10 µm) go with the zero.
+    """
+    light = (LIT._replace(offset_x=0.02), DIM._replace(offset_y=-0.02))
+    rig = campaign.darkened(nominal, light, np.random.default_rng(1))
+    before, after = lit_poses(nominal, light, 5), lit_poses(rig, light, 5)
+    assert before > 30e-6
+    assert after < 2.5e-6
+    assert after < 1.2 * lit_poses(nominal, (misaligned.DARK, misaligned.DARK), 5) + 0.3e-6

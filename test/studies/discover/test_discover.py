@@ -1,8 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""discover: names what was hidden, keeps silent where nothing was, and leaves files that work."""
+"""Whole searches: discover names what was hidden, mistakes of the set-up and laws; nothing where nothing was."""
 
+import dataclasses
 import json
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +14,15 @@ import numpy as np
 import pytest
 
 import psd_deflection
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
-from psd_deflection.model.simulation.catalogue import effect_names, effects_of_rig, make_active
-from psd_deflection.model.simulation.simulator import RigSimulator
-from psd_deflection.recordings.observation import Observation
+from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig, make_active
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.model.simulation.law_files import read_law
+from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, values_of
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.recordings.observation import Observation, read_observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.records import FloatArray, ParameterChange
@@ -23,12 +30,18 @@ from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.check.result import NAMES, Finding
+from psd_deflection.studies.discover.cleaning import clean, outliers
 from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.laws import find_jitter, find_law
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import SignatureBank, solve_observable
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup import correct_wiring, likely_delays, likely_jumps
 from psd_deflection.studies.study import described
+
+from .test_formulas import make_observation
 
 SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 SHARED_SCHEMA = Path(__file__).parents[4] / 'shared' / 'checks' / 'result.schema.json'
@@ -260,3 +273,364 @@ def test_a_finding_has_a_name_that_other_programs_know() -> None:
 @pytest.mark.skipif(not SHARED_SCHEMA.is_file(), reason='the schema is not beside the checkout')
 def test_the_schema_is_that_of_other_programs() -> None:
     assert json.loads(SHARED_SCHEMA.read_text()) == SCHEMA
+
+
+LAW_HISTORY = loads.identification().loads
+LAW_WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(LAW_HISTORY)))
+
+
+def workspace(law: Law | None, seed: int = 0, count: int = len(LAW_HISTORY)) -> Workspace:
+    active = [] if law is None else [ActiveEffect(effect_of(law), values_of(law))]
+    model = ForwardModel(RIG, active)
+    history, warm = LAW_HISTORY[:count], LAW_WARM[:count]
+    samples = model.run(history, warm)
+    samples.volts += RIG.noises.ravel()[:, None] * np.random.default_rng(seed).standard_normal(samples.volts.shape)
+    model.finish(samples)
+    return Workspace([Observation('test', RIG, samples.volts.T.copy(), history, warm)])
+
+
+def test_there_is_no_law_in_noise() -> None:
+    ws = Workspace([make_observation(3)])
+    null = refit(ws, ())
+    assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print) is None
+    assert find_jitter(ws, null, float(np.log(ws.effective_size()))) is None
+
+
+@pytest.mark.slow
+def test_law_is_adopted_and_explains_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs, ours = tmp_path / 'theirs', tmp_path / 'ours'
+    theirs.mkdir()
+    ours.mkdir()
+    hidden = Law('base_moves', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),))
+    (theirs / 'base_moves.yaml').write_text(law_text(hidden))
+    monkeypatch.setenv(FOLDERS, str(theirs))
+    run, out = str(tmp_path / 'run'), tmp_path / 'found'
+    steps = 'steps:0,0,0;10,0,5;-20,10,0;30,-20,-5;-10,-30,10;20,0,-10;0,0,0:1'
+    assert main(['simulate', '--out', run, '--loads', steps, '--effect', 'base_moves,c1=3e-9']) == 0
+    monkeypatch.setenv(FOLDERS, str(ours))
+    # The whole catalogue takes its time, and the blind suite has it.
+    few = [name for name in effect_names() if name not in ('sensor_gain', 'sensor_rotation', 'bending_stiffness')]
+    without = [word for name in few for word in ('--without', name)]
+    assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet', *without]) == 0
+    reported = json.loads((out / 'result.json').read_text())
+    jsonschema.validate(reported, SCHEMA)
+    law = reported['unknown'][0]['law']
+    assert (reported['verdict'], law['stage'], law['variables'], law['kind']) == (
+        'unknown_effect',
+        'psd',
+        ['load_fx'],
+        'static',
+    )
+    assert law['channels'] == ['y2']
+    assert law['heldout_after'] < 1.05 * reported['gap']['floor']
+    assert 'A law for it' in (out / 'report.html').read_text()
+    assert 'yielding' in effect_names()
+    adopted = read_law(ours / 'yielding.yaml')
+    assert adopted.terms[0].coefficient == pytest.approx(3e-9, rel=0.05)
+    (active,) = effects_of_rig(load_rig(out / 'model.yaml'))
+    assert active.effect.name == 'yielding'
+    assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet']) == 2
+    assert main(['discover', run, '--out', str(out), '--adopt', 'a b', '--quiet']) == 2
+
+
+def test_noise_beside_a_movement_is_no_law() -> None:
+    shaky = Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),))
+    ws = workspace(shaky)
+    null = refit(ws, ())
+    penalty = float(np.log(ws.effective_size()))
+    assert find_jitter(ws, null, penalty) is not None
+    moved = workspace(Law('odd', 'psd', 'x1', (LawTerm('product', ('load_fy', 'load_fy'), 1e-8),)))
+    # The same noise, with means of blocks that no noise explains, or of which this one makes a small part.
+    odd = refit(moved, ()).difference
+    for floors in (10.0, 1.8):
+        share = floors * ws.floor() / ws.gap(odd)
+        difference = [a + share * b for a, b in zip(null.difference, odd, strict=True)]
+        assert find_jitter(ws, dataclasses.replace(null, difference=difference), penalty) is None
+
+
+def test_law_with_large_held_out_gap_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
+    null = refit(ws, ())
+    found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
+    assert found is not None
+    nothing: dict[str, Any] = dict.fromkeys(f.name for f in dataclasses.fields(Discovery))
+    without = Discovery(**{**nothing, 'gap_floor': ws.floor(), 'adopted': ''})
+    assert without.adopt('none') is without
+    for floors, written in ((1.9, True), (2.1, False)):
+        concluded = dataclasses.replace(without, law=dataclasses.replace(found, heldout_gap=floors * ws.floor()))
+        assert (concluded.model_of_law is not None) == written
+        assert concluded.adopt(name := f'odd{written}').adopted == name
+        assert (tmp_path / f'{name}.yaml').exists() == written
+
+
+STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
+CUBIC = plant_effect('cubic', EffectParameter('c', 'N/mm^3', -9.0, 9.0, 0.1, 'of u^3'), equation='F += c u^3')
+SQUARE = plant_effect('square', EffectParameter('c', 'N/mm^2', -9.0, 9.0, 0.1, 'of u^2'))
+LIMIT = plant_effect(
+    'limit', EffectParameter('force', 'N', 0.1, 99.0, 0.5, 'greatest', nominal=99.0, grid=(0.5, 1.0)), finite=True
+)
+NOISE = 0.01
+
+
+class Spring(Plant):
+    """F = k u + c u^3, of which the model has no c, and a temperature that rises with F; six pulls."""
+
+    channels: tuple[str, ...] = ('force',)
+    units: tuple[str, ...] = ('N',)
+    cases = tuple('abcdef')
+    library: tuple[Effect, ...] = (STIFFNESS, CUBIC, SQUARE, LIMIT)
+
+    def __init__(self, c: float, k: float = 1.0, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.u = [np.linspace(-1, 1, 50) * (1 + 0.2 * i) for i in range(6)]
+        self.observed = [(k * u + c * u**3 + NOISE * rng.standard_normal(50))[None, :] for u in self.u]
+
+    def measured(self) -> list[FloatArray]:
+        return self.observed
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        return {'u': self.u}
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        k = 1.0 + model.get('stiffness', {'scale': 0.0})['scale']
+        c = model.get('cubic', {'c': 0.0})['c']
+        square = model.get('square', {'c': 0.0})['c']
+        limit = model.get('limit', {'force': 99.0})['force']
+        return [np.clip(k * u + c * u**3 + square * u**2, -limit, limit)[None, :] for u in self.u]
+
+
+@pytest.mark.slow
+def test_a_limit_that_is_not_reached_at_first_is_found() -> None:
+    plant = Spring(0.0)
+    plant.observed = [np.clip(rows, -1.3, 1.3) for rows in plant.observed]
+    (limit,) = psd_deflection.discover_in(plant).effects
+    assert limit.active.values['force'] == pytest.approx(1.3, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_covariance_of_the_sizes_is_that_of_least_squares() -> None:
+    plant = Spring(0.3, k=1.05)
+    found = psd_deflection.discover_in(plant)
+    tree = found.tree()
+    names, matrix = tree['covariance']['names'], np.array(tree['covariance']['matrix'])
+    terms = {'stiffness.scale': np.concatenate(plant.u), 'cubic.c': np.concatenate(plant.u) ** 3}
+    assert sorted(names) == sorted(terms)
+    design = np.stack([terms[name] for name in names], axis=1)
+    expected = NOISE**2 * np.linalg.inv(design.T @ design)
+    # The level of what remains is fitted, from few cases: the same matrix, and no smaller.
+    scale = float(matrix[0, 0] / expected[0, 0])
+    assert 1.0 < scale < 3.0
+    np.testing.assert_allclose(matrix, scale * expected, rtol=0.02)
+    reported = [e['parameters'][p]['sd'] for e in tree['effects'] for p in e['parameters']]
+    assert np.sqrt(np.diag(matrix)).tolist() == pytest.approx(reported)
+
+
+@pytest.mark.slow
+@pytest.mark.repeatable
+def test_the_answer_is_the_same_again() -> None:
+    first, second = (psd_deflection.discover_in(Spring(0.1), seed=3).tree() for _ in range(2))
+    assert first == second
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'cases': ()}, 'cases: there is none'),
+        ({'units': ()}, 'units: 0 of them for 1 channels'),
+        ({'noise': (0.0,)}, r'noise = \(0.0,\): must be one number above 0'),
+        ({'library': (CUBIC, CUBIC)}, 'cubic is there twice'),
+        ({'nuisance': (CUBIC,)}, 'cubic is there twice'),
+        ({'observed': [np.zeros((2, 5))] * 6}, r'measured, a: has the shape \(2, 5\): must be \(1, n\)'),
+        ({'observed': [np.full((1, 5), math.nan)] * 6}, 'force has 0 values in all'),
+        ({'observed': [np.zeros((1, 5))] * 6}, r'simulate, a: has the shape \(1, 50\): must be that of measured'),
+        ({'u': [np.full(50, math.nan)] * 6}, 'simulate, a: not finite with'),
+        ({'observed': [np.zeros((1, 50))] * 5}, 'measured: 5 tables for 6 cases'),
+    ],
+)
+def test_a_plant_that_contradicts_itself_is_rejected(change: Mapping[str, object], words: str) -> None:
+    plant = Spring(0.3)
+    for name, value in change.items():
+        setattr(plant, name, value)
+    if change.get('cases') == ():
+        plant.observed = []
+    with pytest.raises(ConfigError, match=words):
+        psd_deflection.discover_in(plant)
+
+
+PUSHES = [(0.0, -40.0, -15.0), (0.0, -40.0, 0.0), (25.0, 0.0, 0.0), (0.0, 15.0, 20.0)]
+SET_UP = loads.steps([(0.0, 0.0, 0.0), *PUSHES, (0.0, 0.0, 0.0)], 1.0).loads
+
+
+def recorded(seed: int = 0, **true: object) -> Observation:
+    """A recording of a rig that differs by ``true`` from the rig file, which stays the nominal one."""
+    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
+    counts = RigSimulator(rig, seed).step(SET_UP).counts
+    return Observation('seen', RIG, counts.astype(np.float64) * RIG.converter.volts_per_count, SET_UP.copy())
+
+
+def changed(o: Observation, change: Callable[[FloatArray], FloatArray]) -> Observation:
+    return dataclasses.replace(o, volts=change(o.volts.copy()))
+
+
+def loaded(o: Observation, *factors: float) -> Observation:
+    return dataclasses.replace(o, loads=o.loads * np.array(factors))
+
+
+def reversed_signs(*channels: int) -> Callable[[FloatArray], FloatArray]:
+    signs = np.ones(6)
+    signs[list(channels)] = -1.0
+    return lambda volts: volts * signs
+
+
+def ordered(*columns: int) -> Callable[[FloatArray], FloatArray]:
+    return lambda volts: volts[:, list(columns)]
+
+
+@pytest.mark.parametrize(
+    ('mistake', 'named'),
+    [
+        (lambda o: o, []),
+        (lambda o: changed(o, reversed_signs(1)), [('channel_sign', 'y1', -1.0, 'psd_1.axes: [x, -y]')]),
+        (lambda o: changed(o, reversed_signs(3)), [('channel_sign', 'x2', -1.0, "psd_2.axes: [-x, 'y']")]),
+        (lambda o: changed(o, ordered(1, 0, 2, 3, 4, 5)), [('axis_swap', 'psd_1', None, "psd_1.axes: ['y', x]")]),
+        (lambda o: changed(o, ordered(3, 4, 5, 0, 1, 2)), [('psd_swap', 'psd_1 psd_2', None, 'psds_exchanged: true')]),
+        (lambda o: loaded(o, 1.0, -1.0, 1.0), [('load_sign', 'fy', -1.0, 'turn the sign of load_fy in the recording')]),
+        (lambda o: loaded(o, 1.0, 1.0, -1.0), [('load_sign', 'tz', -1.0, 'turn the sign of load_tz in the recording')]),
+        (
+            lambda o: loaded(o, 1 / 9.80665, 1 / 9.80665, 1.0),
+            [
+                (
+                    'load_unit',
+                    'fx fy',
+                    9.80665,
+                    'multiply load_fx load_fy in the recording by 9.80665: it is noted in kg instead of N',
+                )
+            ],
+        ),
+        (
+            lambda o: loaded(o, 1.0, 1.0, 1e3),
+            [
+                (
+                    'load_unit',
+                    'tz',
+                    1e-3,
+                    'multiply load_tz in the recording by 0.001: it is noted in N mm instead of N m',
+                )
+            ],
+        ),
+    ],
+)
+def test_wiring_signs_and_units_are_put_right(
+    mistake: Callable[[Observation], Observation], named: list[tuple[str, str, float | None, str]]
+) -> None:
+    o = recorded()
+    wrong = mistake(o)
+    (corrected,), findings, lines = correct_wiring([wrong], ())
+    assert [(f.name, f.where, f.value, f.fix) for f in findings] == named
+    np.testing.assert_array_equal(corrected.volts, o.volts)
+    np.testing.assert_allclose(corrected.loads, o.loads, rtol=1e-9)
+    # The lines alone wire the rig file right.
+    assert replace_values(RIG, lines).values == corrected.rig.values
+
+
+@pytest.mark.slow
+def test_alike_units_differ_where_movement_is_nonlinear() -> None:
+    """50 N at the end of a bar: what moves in proportion to the load is 1 % off, and the units are 2 % apart."""
+    loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
+    volts = np.asarray(RigSimulator(RIG, 1).step(loads).counts * RIG.converter.volts_per_count, dtype=np.float64)
+    for factor in (9.80665e-3, 1e-2):
+        annotated = np.asarray(loads / (1.0, 1.0, factor), dtype=np.float64)
+        _, findings, _ = correct_wiring([Observation('x', RIG, volts, annotated)], ())
+        assert [(f.where, f.value) for f in findings] == [('tz', factor)]
+
+
+def test_a_soft_or_stiff_link_is_no_other_unit() -> None:
+    for modulus in (6.9e11, 6.9e9, 7.2e10, 5e10):
+        _, findings, _ = correct_wiring([recorded(link__youngs_modulus=modulus)], ())
+        assert findings == []
+
+
+SET_UP_NEAR = (
+    *('load_direction', 'bending_stiffness', 'torsional_stiffness', 'damping', 'creep', 'sensor_rotation'),
+    *('sensor_gain', 'sensor_position', 'amplifier_lag', 'channel_skew'),
+)
+"""What might stand in for a mistake of the set-up. The rest of the catalogue takes time and tells nothing more."""
+
+
+def found_in(*observations: Observation, full: bool = False) -> Discovery:
+    found = discover(observations, RIG, without=() if full else [n for n in effect_names() if n not in SET_UP_NEAR])
+    tree = found.tree()
+    assert json.loads(json.dumps(tree, allow_nan=False)) == tree
+    return found
+
+
+@pytest.mark.slow
+def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
+    """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
+    found = found_in(recorded(link__length=0.585 * 1.02), full=True)
+    assert (found.verdict, found.effects) == ('nothing_missing', ())
+    (mistake,) = found.setup
+    assert (mistake.name, mistake.where) == ('link_length', 'link.length')
+    assert mistake.value == pytest.approx(1.02, abs=1e-4)
+    assert mistake.fix.startswith('link.length: 0.596')
+    assert found.floors < 1.05
+    assert 'The set-up is not as' in found.sentence
+
+
+def test_a_jump_is_found_at_its_sample() -> None:
+    o = recorded()
+    o.volts[2600:, 0] += 0.02
+    workspace = Workspace([o])
+    (recording, psd, time), *_ = likely_jumps(workspace, workspace.residual(())[0])
+    assert (recording, psd) == (1, 1)
+    assert time == pytest.approx(2.6, abs=0.004)
+    assert likely_delays(workspace) == []
+
+
+@pytest.mark.parametrize('share', [0.001, 0.05])
+def test_outliers_are_excluded_and_movement_is_kept(share: float) -> None:
+    o = recorded()
+    rng = np.random.default_rng(3)
+    bad = rng.random(o.volts.shape) < share
+    volts = o.volts + np.where(bad, rng.choice((-1.0, 1.0), bad.shape) * rng.uniform(0.1, 5.0, bad.shape), 0.0)
+    cleaned, findings = clean(dataclasses.replace(o, volts=volts), ())
+    gone = np.isnan(cleaned.volts)
+    assert findings == []
+    assert np.mean(gone[bad]) > 0.999
+    assert np.mean(gone[~bad]) < 1e-3
+    # Neither a step of the load nor hum of a hundred times the noise.
+    t = np.arange(len(o.volts))[:, None] / 1000.0
+    assert not outliers(o.volts + 0.2 * np.sin(2.0 * np.pi * 50.0 * t), 5e-4).any()
+
+
+def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None = None) -> Path:
+    lines = ['t,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz']
+    for i in range(len(o.volts)) if rows is None else rows:
+        numbers = [i * step, *o.volts[i].tolist(), *o.loads[i].tolist()]
+        lines.append(','.join(f'{v:.9g}' for v in numbers))
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+@pytest.mark.slow
+def test_command_prints_lines_and_puts_them_in_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Y of PSD 1 turned, and times of 800 samples a second against the 1000 of the rig file."""
+    rig = replace_values(RIG, {'converter.sample_rate_hz': 800.0})
+    counts = RigSimulator(rig, 0).step(SET_UP).counts
+    volts = counts.astype(np.float64) * RIG.converter.volts_per_count * np.array([1, -1, 1, 1, 1, 1])
+    path = csv_of(Observation('seen', RIG, volts, SET_UP), tmp_path / 'seen.csv', 1.0 / 800.0)
+    out = tmp_path / 'out'
+    assert main(['discover', str(path), '--out', str(out), '--quiet']) == 0
+    message = capsys.readouterr().out
+    assert 'set-up: channel_sign y1: psd_1.axes: [x, -y]' in message
+    assert 'set-up: sample_rate converter.sample_rate_hz: converter.sample_rate_hz: 800' in message
+    model: Rig = load_rig(out / 'model.yaml')
+    assert model.psds[0].axes == ('x', '-y')
+    assert model.converter.sample_rate_hz == 800.0
+    tree = json.loads((out / 'result.json').read_text())
+    assert tree['verdict'] == 'nothing_missing'
+    assert [s['name'] for s in tree['setup']] == ['sample_rate', 'channel_sign']
+    assert clean(read_observation(path, model), ())[1] == []
+    assert correct_wiring([read_observation(path, model)], ())[1] == []

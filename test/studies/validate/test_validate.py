@@ -1,7 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison as a whole and what it compares: times, solvers, sources of a made-up recording."""
+"""The comparison as a whole and its parts: times, solvers, bias, scale and noise of made-up recordings."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import cast
 
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
+from scipy.stats import linregress
 
 from blind.generator import flat_dots
 from psd_deflection.base.errors import ConfigError, SolverError
@@ -21,9 +24,10 @@ from psd_deflection.records import FloatArray, Mark, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.study import Opened
 from psd_deflection.studies.validate import from_recordings as module
-from psd_deflection.studies.validate.clock import Motion
+from psd_deflection.studies.validate.agreement import Agreement, agreement
+from psd_deflection.studies.validate.clock import Motion, Offset
 from psd_deflection.studies.validate.from_recordings import ValidateProblem, read_validate
-from psd_deflection.studies.validate.validate import validate
+from psd_deflection.studies.validate.validate import Validated, validate
 
 LATE = 0.0123
 """s, by which the stamps of the reference are early."""
@@ -219,3 +223,276 @@ def test_of_all_solvers_those_that_can_are_compared(run: Opened) -> None:
     for solvers in (['appendix_d'], ['all', 'appendix_d']):
         with pytest.raises(SolverError, match='appendix_d divides by both'):
             read_validate(inline, solvers=solvers)
+
+
+def test_bias_scale_and_noise_are_separated() -> None:
+    rng = np.random.default_rng(0)
+    true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 3000))
+    reference = true + rng.normal(0.0, 10e-6, 3000)
+    found = agreement(1.004 * true + 5e-6, reference)
+    assert found.bias == pytest.approx(5e-6 + 0.004 * true.mean(), abs=4 * found.bias_sd)
+    assert found.scale == pytest.approx(0.004, abs=4 * found.scale_sd)
+    assert found.scale_sd < 3e-4
+    assert found.noise == pytest.approx(10e-6, rel=0.05)
+    assert found.share == pytest.approx(found.rms / np.abs(reference).max())
+
+
+def test_a_noisy_reference_does_not_shrink_the_scale() -> None:
+    rng = np.random.default_rng(1)
+    true = 1e-4 * np.sin(np.linspace(0.0, 300.0, 20000))
+    found = agreement(true, true + rng.normal(0.0, 50e-6, 20000))
+    # The slope of the estimate on this reference would be 1/3 too small.
+    assert abs(found.scale) < 4 * found.scale_sd < 0.1
+
+
+def test_limits_are_those_of_bland_and_altman() -> None:
+    estimate = np.array([1.0, 2.0, 3.0, 4.0, 6.0])
+    reference = np.array([1.1, 1.8, 3.3, 3.9, 5.7])
+    found = agreement(estimate, reference)
+    d = estimate - reference
+    assert found.bias == pytest.approx(d.mean())
+    assert found.limits == pytest.approx((d.mean() - 1.96 * d.std(ddof=1), d.mean() + 1.96 * d.std(ddof=1)))
+    assert found.rms == pytest.approx(np.sqrt((d**2).mean()))
+    assert found.largest == pytest.approx(0.3)
+
+
+def test_a_reference_that_moves_the_other_way_is_mirrored() -> None:
+    rng = np.random.default_rng(3)
+    true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 3000))
+    noise = rng.normal(0.0, 10e-6, 3000)
+    assert agreement(true, noise - true).mirrored
+    assert not agreement(true, noise + true).mirrored
+    assert not agreement(rng.normal(0.0, 1e-6, 3000), noise).mirrored
+
+
+def test_deviations_match_many_runs_of_coloured_noise() -> None:
+    rng = np.random.default_rng(4)
+    true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 400))
+    plain, half = [], []
+    for _ in range(200):
+        noise = rng.normal(0.0, 10e-6, 400)
+        for i in range(1, 400):
+            noise[i] += 0.9 * noise[i - 1]
+        plain.append(agreement(true, true + noise))
+        half.append(agreement(true, 2.0 * true + noise))
+    assert np.std([f.bias for f in plain]) == pytest.approx(np.median([f.bias_sd for f in plain]), rel=0.35)
+    assert np.mean([f.scale for f in half]) == pytest.approx(-0.5, abs=1e-3)
+    assert np.std([f.scale for f in half]) == pytest.approx(np.median([f.scale_sd for f in half]), rel=0.35)
+
+
+def test_slope_and_deviations_are_those_of_a_regression() -> None:
+    """Errors that change sign each time have no memory: the deviations are those of least squares."""
+    estimate = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 7.0, 8.0, 9.0, 11.0, 12.0]) + 100.0
+    error = 0.1 * np.resize([1.0, -1.0], 10) * [1.0, 2.0, 1.0, 3.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0]
+    reference = 0.8 * estimate - 3.0 + error
+    found = agreement(estimate, reference)
+    fit = linregress(estimate, reference)
+    left = reference - fit.slope * estimate - fit.intercept
+    assert found.scale == pytest.approx(1.0 / fit.slope - 1.0)
+    assert found.noise == pytest.approx(np.sqrt(left @ left / 8.0))
+    # Of one over the slope.
+    assert found.scale_sd == pytest.approx(fit.stderr / fit.slope**2)
+    assert found.share == pytest.approx(found.rms / reference[-1])
+    even = agreement(5.0 + error, np.full(10, 5.0))
+    assert even.bias_sd == pytest.approx(error.std(ddof=1) / math.sqrt(10.0))
+
+
+def test_an_estimate_that_stands_still_has_no_scale() -> None:
+    found = agreement(np.full(20, 0.5), np.resize([0.0, 1.0, 0.2], 20))
+    assert math.isnan(found.scale)
+    assert math.isnan(found.scale_sd)
+    assert math.isnan(found.share)
+    assert not found.mirrored
+    assert found.noise == pytest.approx(np.resize([0.0, 1.0, 0.2], 20).std(ddof=1))
+    assert found.largest == 0.5
+
+
+PERIOD = 2.0**-10
+"""s: sums of it are exact."""
+
+
+def of(kept: FloatArray, seed: int = 0, period: float = PERIOD) -> Motion:
+    """Samples at the places ``kept``, a cubic with noise on each channel."""
+    rng = np.random.default_rng(seed)
+    t = kept * period
+    dots = np.stack([a + 40.0 * a * t - 900.0 * t**2 + 9e4 * a * t**3 for a in (1.0, -2.0, 0.5, 3.0)], axis=1)
+    return Motion(t, dots + rng.normal(0.0, 0.1, dots.shape), period, first_three)
+
+
+@pytest.mark.parametrize(('exposure', 'half'), [(0.0, 8), (7.8, 12), (10.0, 13), (0.5, 9)])
+def test_instant_has_polynomial_through_nearby_samples(exposure: float, half: int) -> None:
+    """``exposure`` in samples: eight samples on either side of it."""
+    places = np.delete(np.arange(120.0), [40, 41, 44, 77])
+    motion = of(places)
+    at = np.array([5.3, 20.0, 30.2, 30.45, 30.7, 43.4, 45.9, 76.6, 90.0, 115.8])
+    values, rates, variances = motion.dots_at(at * PERIOD, exposure * PERIOD)
+    inside, weights = np.polynomial.legendre.leggauss(8)
+    for i, instant in enumerate(at):
+        near = np.abs(places - instant) <= half + 0.5
+        for channel in range(4):
+            # From the instant, in samples.
+            u = places[near] - instant
+            fit = Polynomial.fit(u, motion.dots[near, channel], 4).convert()
+            deviation = fit.integ()
+            mean = (deviation(0.5 * exposure) - deviation(-0.5 * exposure)) / exposure if exposure else fit(0.0)
+            ends = (fit(0.5 * exposure) - fit(-0.5 * exposure)) / exposure if exposure else fit.deriv()(0.0)
+            assert values[i, channel] == pytest.approx(mean, rel=1e-9)
+            assert rates[i, channel] == pytest.approx(ends / PERIOD, rel=1e-8)
+            left = motion.dots[near, channel] - fit(u)
+            design = np.vander(u / half, 5)
+            share = 0.5 * weights @ np.vander(0.5 * exposure * inside / half, 5)
+            factor = share @ np.linalg.solve(design.T @ design, share)
+            assert variances[i, channel] == pytest.approx(left @ left / (len(u) - 5) * factor, rel=1e-7)
+
+
+def test_nothing_is_known_of_instants_outside_the_samples() -> None:
+    motion = of(np.arange(40.0))
+    values, _, _ = motion.dots_at(np.array([-5.0, 2.0, 2.5, 3.0, 36.0, 36.5, 37.5, 60.0]) * PERIOD)
+    assert np.isfinite(values[:, 0]).tolist() == [False, False, True, True, True, True, False, False]
+
+
+def test_single_samples_lie_on_an_even_grid() -> None:
+    # Samples 2 and 5 are lost, that of place 6 has no pose; the stamps tremble.
+    t = 7.0 + np.array([0.0, 1.2, 2.9, 4.1, 6.0, 7.2, 8.0]) * 1e-3
+    dots = np.array([[0.0, 5.0, 1.0], [2.0, 5.0, 1.0], [6.0, 5.0, 3.0], [4.0, 5.0, 4.0], [9.0, 9.0, 9.0]])
+    dots = np.concatenate([dots, [[10.0, 8.0, 7.0], [3.0, 5.0, 0.0]]])
+    asked = []
+
+    def solve(d: FloatArray) -> FloatArray:
+        asked.append(len(d))
+        poses = first_three(d)
+        poses[4, 1] = np.nan
+        return poses
+
+    motion = Motion(t, np.column_stack([dots, np.zeros(7)]), 1e-3, solve)
+    poses, there = motion.grid()
+    assert there.tolist() == [True, True, False, True, True, False, False, True, True]
+    np.testing.assert_allclose(poses[:, 0], [0.0, 2.0, 4.0, 6.0, 4.0, 6.0, 8.0, 10.0, 3.0])
+    np.testing.assert_allclose(poses[:, 1], [5.0, 5.0, 5.0, 5.0, 5.0, 6.0, 7.0, 8.0, 5.0])
+    np.testing.assert_allclose(poses[:, 2], [1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 0.0])
+    assert motion.grid()[0] is poses
+    assert asked == [7]
+    assert '_grid=' not in repr(motion)
+
+
+def none(dots: FloatArray) -> FloatArray:
+    return dots[:, :3]
+
+
+STAMPED_LATE = Offset(0.0123, 1e-4, 0.0, 1e-6, True, (), 100)
+X = Agreement(1.5e-6, 0.25e-6, (-2.5e-6, 5.5e-6), 0.004, 0.001, 2e-6, 3e-6, 4e-6, 0.05)
+Y = Agreement(-2e-6, 0.5e-6, (-4e-6, 0.0), math.nan, math.nan, 5e-6, 6e-6, 7e-6, math.nan, mirrored=True)
+# A milliradian is 57.3 mdeg.
+TWIST = Agreement(1e-3, 1e-4, (-1e-3, 2e-3), -0.02, 0.005, 2e-3, 3e-3, 4e-3, 1.25)
+PROBLEM = ValidateProblem(
+    motion=Motion(np.arange(30.0), np.zeros((30, 4)), 1.0, none),
+    solvers={'exact': none, 'wls': none},
+    t=np.arange(4.0),
+    reference=np.zeros((4, 3)),
+    sd=None,
+    rejected={},
+    estimate_sd=np.ones(3),
+    align=False,
+    largest=1.0,
+    exposure=0.0,
+    sources={'recording': 'run.csv', 'reference': 'camera.csv'},
+)
+PLAIN = Validated(
+    problem=PROBLEM,
+    t=np.arange(4.0),
+    reference=np.arange(12.0).reshape(4, 3),
+    estimates={'exact': 10.0 * np.arange(12.0).reshape(4, 3), 'wls': np.full((4, 3), math.nan)},
+    agreements={'exact': (X, Y, TWIST), 'wls': (Y, X, TWIST)},
+    offset=STAMPED_LATE,
+    applied=False,
+    covered=(math.nan, math.nan, math.nan),
+    excluded=0,
+)
+
+
+def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
+    assert PLAIN.sentences() == [
+        'ΔX: the estimate is +1.50 ± 0.49 µm off on average; 95 % of the differences lie between -2.5 and +5.5 µm; '
+        'it is +0.400 ± 0.196 % larger.',
+        'ΔY: the estimate is -2.00 ± 0.98 µm off on average; 95 % of the differences lie between -4.0 and +0.0 µm; '
+        'the reference moves the other way: turn its sign (of a camera, camera.view), '
+        'or that of the readings if `psd-deflection check` says so.',
+        'θ: the estimate is +57.30 ± 11.23 mdeg off on average; 95 % of the differences lie between -57.3 and '
+        '+114.6 mdeg; it is -2.000 ± 0.980 % larger.',
+        STAMPED_LATE.sentence,
+        'It was not removed; --align removes it.',
+    ]
+
+
+@pytest.mark.parametrize(
+    ('offset', 'applied', 'words'),
+    [
+        (STAMPED_LATE, True, 'The offset was removed before the comparison.'),
+        (STAMPED_LATE, False, 'It was not removed; --align removes it.'),
+        (replace(STAMPED_LATE, value=-0.0123), False, 'It was not removed; --align removes it.'),
+        # 0.19 ms with 0.1 ms of deviation is no offset, 0.2 ms is one.
+        (replace(STAMPED_LATE, value=0.2e-3), False, 'It was not removed; --align removes it.'),
+        (replace(STAMPED_LATE, value=0.19e-3), False, None),
+        (replace(STAMPED_LATE, value=-0.19e-3), False, None),
+        # It is large, but nobody knows how large.
+        (replace(STAMPED_LATE, explained=False), False, None),
+        (replace(STAMPED_LATE, alternatives=(0.2,)), False, None),
+    ],
+)
+def test_offset_removal_is_reported_if_offset_exists(offset: Offset, applied: bool, words: str | None) -> None:
+    message = replace(PLAIN, offset=offset, applied=applied).sentences()
+    assert message[3] == offset.sentence
+    assert message[4:] == ([] if words is None else [words])
+
+
+def test_coverage_is_reported_if_reference_has_sd() -> None:
+    message = replace(PLAIN, covered=(0.95, 0.5, 1.0)).sentences()
+    assert len(message) == 6
+    assert message[3] == (
+        'Differences within 1.96 standard deviations of both instruments (95 % expected): ΔX 95.0 %, ΔY 50.0 %, '
+        'θ 100.0 %.'
+    )
+
+
+def test_what_was_left_out_and_rejected_is_counted() -> None:
+    found = replace(PLAIN, excluded=3, problem=replace(PROBLEM, rejected={'too dark': 2, 'blurred': 5}))
+    assert found.sentences()[-2:] == [
+        '3 of 7 references have no samples about them and are left out.',
+        'The reference gave no answer 7 times: blurred 5, too dark 2.',
+    ]
+    assert len(found.sentences()) == 7
+
+
+def test_the_table_has_the_solvers_in_units_that_people_read() -> None:
+    rows = PLAIN.rows()
+    assert rows == [
+        ['solver', 'axis', 'unit', 'bias', 'scale %', 'noise', 'rms', 'largest', '% of deflection'],
+        ['exact', 'ΔX', 'µm', '+1.50', '+0.400', '2.00', '3.00', '4.00', '5.00'],
+        ['', 'ΔY', 'µm', '-2.00', '-', '5.00', '6.00', '7.00', '-'],
+        ['', 'θ', 'mdeg', '+57.30', '-2.000', '114.59', '171.89', '229.18', '125.00'],
+        ['wls', 'ΔX', 'µm', '-2.00', '-', '5.00', '6.00', '7.00', '-'],
+        ['', 'ΔY', 'µm', '+1.50', '+0.400', '2.00', '3.00', '4.00', '5.00'],
+        ['', 'θ', 'mdeg', '+57.30', '-2.000', '114.59', '171.89', '229.18', '125.00'],
+    ]
+    lines = PLAIN.lines()
+    assert lines[:6] == [*PLAIN.sentences(), '']
+    assert [line.split() for line in lines[6:]][2:] == [[c for c in row if c] for row in rows[1:]]
+    # Words lie to the left, numbers to the right.
+    assert lines[9] == '        ΔY    µm     -2.00        -    5.00    6.00     7.00                -'
+
+
+def test_programs_get_si_units() -> None:
+    tree = replace(PLAIN, excluded=3, problem=replace(PROBLEM, rejected={'blurred': 5})).tree()
+    assert tree['solver'] == 'exact'
+    assert tree['references'] == 4
+    assert tree['left_out'] == 3
+    assert tree['rejected'] == {'blurred': 5}
+    offset = tree['offset']
+    assert offset['value'] == 0.0123
+    assert offset['interval'] == pytest.approx((0.0123 - 0.196e-3, 0.0123 + 0.196e-3))
+    assert (offset['determined'], offset['applied'], offset['unit']) == (True, False, 's')
+    assert offset['sentence'] == STAMPED_LATE.sentence
+    assert list(tree['solvers']) == ['exact', 'wls']
+    assert [one['unit'] for one in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
+    assert tree['solvers']['wls']['dy']['bias'] == 1.5e-6
+    assert list(tree['covered']) == ['dx', 'dy', 'theta']
