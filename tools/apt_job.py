@@ -27,7 +27,9 @@ APT = r"""#!/bin/bash
 words=()
 for word in "$@"; do
   case $word in
-    ros-*) echo "/opt/ros stands in for $word"; : >/var/lib/dpkg/info/$word.list
+    ros-*) echo "/opt/ros stands in for $word"
+      if dpkg-query -W "$word" >/dev/null 2>&1; then continue; fi
+      : >"/var/lib/dpkg/info/$word.list"
       printf 'Package: %s\nStatus: install ok installed\nVersion: 1\nArchitecture: all\n' "$word" >>/var/lib/dpkg/status
       printf 'Maintainer: none\nDescription: none\n\n' >>/var/lib/dpkg/status;;
     python3-colcon-common-extensions) words+=(colcon python3-colcon-{defaults,library-path,notification,output} \
