@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from bench import cpu, page
 from bench.campaign import soak
 from bench.campaign.crash import evaluate, left_by_a_kill
 from bench.campaign.fuzz import GRAMMARS, TARGETS, corrupted, evaluated
 from bench.campaign.line import Line
+from bench.rows import read
 from psd_deflection.rig.config import Rig, load_rig
 
 pytestmark = pytest.mark.slow
@@ -79,3 +81,12 @@ def test_fuzz_targets_accept_good_and_reject_bad_input(name: str) -> None:
 def test_damaged_frames_are_rejected(capsys: pytest.CaptureFixture[str]) -> None:
     assert corrupted(20_000) == 0
     assert ' 0 accepted with a wrong content' in capsys.readouterr().out
+
+
+def test_the_page_is_made_of_the_results() -> None:
+    assert page.PAGE.read_text(encoding='utf-8') == page.page(*read(), *read(cpu.RESULTS))
+    assert '<!--' not in page.PAGE.read_text(encoding='utf-8')
+    assert page.PAGE == ROOT / 'docs' / 'performance.md'
+    text = page.README.read_text(encoding='utf-8')
+    assert page.readme(text, read()[0]) == text
+    assert sum(line.endswith(page.PRINTED_BY) for line in text.split('\n')) == 3

@@ -205,10 +205,6 @@ SECTIONS = {name.partition('.')[0] for name in BY_NAME} | {'effects'}
 NO_RIGS = {'target', 'connection', 'name', 'distributed', 'scrape_configs', 'controller_manager'}
 
 
-def test_there_are_snippets_of_rigs() -> None:
-    assert sum('ros__parameters' in text for _, text in SNIPPETS) >= 5
-
-
 @pytest.mark.parametrize(('page', 'text'), SNIPPETS, ids=[f'{p.stem}_{i}' for i, (p, _) in enumerate(SNIPPETS)])
 def test_a_rig_in_a_page_can_be_pasted(page: Path, text: str, tmp_path: Path) -> None:
     tree = YAML(typ='safe').load(text)
