@@ -21,7 +21,7 @@ CANNOT = {
     r' -m bench\.mock_hardware$': 'the controllers of ros2_control are C++, which no registry has',
     r'^ *ros2 bag info ': 'rosbag2_py is C++, which no registry has',
 }
-"""Lines that are told instead of run."""
+"""Lines that are reported instead of run."""
 
 APT = r"""#!/bin/bash
 words=()
@@ -111,12 +111,12 @@ def main(argv: list[str] | None = None) -> int:
     words = ' '.join(f"'{name}={value}'" for name, value in env.items())
     failed = 0
     for step in (step for step in job['steps'] if 'run' in step and step['name'] != options.skip):
-        lines, told = step['run'].splitlines(), []
+        lines, reported = step['run'].splitlines(), []
         for i, line in enumerate(lines):
             why = next((why for pattern, why in CANNOT.items() if re.search(pattern, line)), '')
             if why:
                 lines[i] = ':'
-                told.append(f'{"":14}cannot run here: {line.strip()}: {why}')
+                reported.append(f'{"":14}cannot run here: {line.strip()}: {why}')
         text = re.sub(r'\$\{\{ matrix\.(\w+) \}\}', lambda found: str(row[found[1]]), '\n'.join(lines))
         (chroot / 'root/step.sh').write_text(text)
         begun, log = time.monotonic(), chroot / f'root/{step["name"].split()[0]}.log'
@@ -124,8 +124,8 @@ def main(argv: list[str] | None = None) -> int:
         with log.open('wb') as out:
             status = subprocess.run(inside(chroot, shell), stdout=out, stderr=out, check=False).returncode
         print(f'{"FAILED" if status else "passed"} {time.monotonic() - begun:5.0f} s {step["name"]}', flush=True)
-        told += log.read_text(errors='replace').splitlines()[-40:] if status else []
-        print(*(f'{line}\n' for line in told), sep='', end='', flush=True)
+        reported += log.read_text(errors='replace').splitlines()[-40:] if status else []
+        print(*(f'{line}\n' for line in reported), sep='', end='', flush=True)
         failed += status != 0
     print(f'{failed} steps failed, load {os.getloadavg()[0]:.1f}; stood in for: ROS from apt, tf2_ros, rosdistro')
     return 1 if failed else 0

@@ -64,7 +64,7 @@ def run(tree: Path, program: str, *words: str) -> str:
     return done.stdout
 
 
-def judge(tree: Path, words: set[str], before: set[str], fast: bool) -> str:
+def verdict_of(tree: Path, words: set[str], before: set[str], fast: bool) -> str:
     """The last line of the tests of a tree without the commands ``words``. Raises ValueError for what is wrong."""
     lost = before - set(json.loads(run(tree, 'python', '-c', COMMANDS)))
     if odd := words - lost | {name for name in lost - words if name.partition(' ')[0] not in words}:
@@ -103,7 +103,7 @@ def main(words: list[str]) -> int:
             try:
                 if importers := [str(file) for file in package if imports_it.search(file.read_text())]:
                     raise ValueError(f'imported by {importers}')
-                verdict = f'green | {judge(tree, named, before, "--fast" in words)} |'
+                verdict = f'green | {verdict_of(tree, named, before, "--fast" in words)} |'
             except ValueError as error:
                 status, verdict = 1, f'NOT GREEN | |\n{error}'
             size = sum(lines.get(file, 0) for file in gone)

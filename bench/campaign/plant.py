@@ -114,8 +114,8 @@ class Spun:
         while not condition():
             if time.monotonic() > until:
                 if what:
-                    said = self.program.text[-1000:] if self.program is not None else ''
-                    raise RuntimeError(f'waited {seconds:g} s for {what}\n{said}')
+                    message = self.program.text[-1000:] if self.program is not None else ''
+                    raise RuntimeError(f'waited {seconds:g} s for {what}\n{message}')
                 return False
             self.executor.spin_once(timeout_sec=0.01)
         return True

@@ -129,14 +129,14 @@ def test_a_turn_is_that_of_its_vector_however_small(size: float) -> None:
 
 def test_keystone_and_error_of_centres_turn_with_the_target() -> None:
     prior, c, s = PosePrior(rotation_matrix(np.array([0.0, 0.0, 0.7])), 0.1, np.array([0.3, -0.1])), 0.8, 0.6
-    turned = expected(prior, rotation_matrix(np.array([0.0, 0.0, 0.7 - math.atan2(s, c)])))
-    assert turned == pytest.approx([c * 0.3 + s * 0.1, s * 0.3 - c * 0.1])
+    rotated = expected(prior, rotation_matrix(np.array([0.0, 0.0, 0.7 - math.atan2(s, c)])))
+    assert rotated == pytest.approx([c * 0.3 + s * 0.1, s * 0.3 - c * 0.1])
     rotation = rotation_matrix(np.array([0.4, -0.3, 0.2]))
     shape = Shape(rotation, np.array([0.0, 0.0, 0.5]), 1.0, np.eye(2), np.zeros(4), np.zeros((3, 6)), np.zeros(2))
-    judge = RimClassifier(
+    classifier = RimClassifier(
         cast(Any, SimpleNamespace(focal=1000.0)), 100, np.array([[0.03, 0.0], [0.0, 0.04], [0.0, 0.0]])
     )
-    covariance = judge.moved_centres(shape, 2.0)
+    covariance = classifier.moved_centres(shape, 2.0)
     # Two pixels are a millimetre at the target: in its plane, and about its normal.
     in_plane = np.eye(3) - np.outer(rotation[:, 2], rotation[:, 2])
     np.testing.assert_allclose(covariance[3:, 3:], 1e-6 * in_plane, atol=1e-20)

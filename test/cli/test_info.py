@@ -123,9 +123,9 @@ def test_only_recorded_parameters_are_reported_as_defaults(tmp_path: Path, capsy
         with BagWriter(tmp_path / heading, rig_values=values) as out:
             out.put(block(0))
         assert main(['info', str(tmp_path / heading)]) == 0
-        told = capsys.readouterr().out
-        assert f'  {heading} parameters at their defaults' in told
-        assert (f'{len(every) - len(links)} parameters of a rig are not in the recording' in told) == (values is links)
+        text = capsys.readouterr().out
+        assert f'  {heading} parameters at their defaults' in text
+        assert (f'{len(every) - len(links)} parameters of a rig are not in the recording' in text) == (values is links)
 
 
 def test_convert_there_and_back_keeps_every_bit(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,7 +46,7 @@ CLOUD = 'sensor_msgs/msg/PointCloud2'
 
 
 @pytest.fixture(scope='module')
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def complete_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags') / 'run'
     with BagWriter(folder, rig_values=load_rig(None, {'sum_min': 1.5}).values, device_hello=HELLO) as out:
         for r in run(150):
@@ -55,8 +55,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_every_record_comes_back(whole: Path) -> None:
-    recording = open_recording(whole)
+def test_every_record_comes_back(complete_bag: Path) -> None:
+    recording = open_recording(complete_bag)
     records = list(run(150))
     assert_same(list(recording.blocks()), [r for r in records if isinstance(r, SampleBlock)])
     assert recording.loads() == [r for r in records if isinstance(r, AppliedLoad)]
@@ -73,8 +73,8 @@ def test_every_record_comes_back(whole: Path) -> None:
 
 
 @pytest.mark.slow
-def test_recorded_estimates_come_back(whole: Path) -> None:
-    series = open_recording(whole).estimates()
+def test_recorded_estimates_come_back(complete_bag: Path) -> None:
+    series = open_recording(complete_bag).estimates()
     assert set(series) == {
         '/link_tip/deflection',
         '/link_tip/deflection_with_covariance',
@@ -95,15 +95,15 @@ def test_recorded_estimates_come_back(whole: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_lone_file_and_a_folder_without_metadata_are_read(whole: Path, tmp_path: Path) -> None:
-    expected = list(open_recording(whole).blocks())
-    assert_same(list(open_recording(whole / 'run_0.mcap').blocks()), expected)
-    shutil.copytree(whole, tmp_path / 'bare')
+def test_a_lone_file_and_a_folder_without_metadata_are_read(complete_bag: Path, tmp_path: Path) -> None:
+    expected = list(open_recording(complete_bag).blocks())
+    assert_same(list(open_recording(complete_bag / 'run_0.mcap').blocks()), expected)
+    shutil.copytree(complete_bag, tmp_path / 'bare')
     (tmp_path / 'bare' / 'metadata.yaml').unlink()
     bare = open_recording(tmp_path / 'bare')
     assert_same(list(bare.blocks()), expected)
     assert 'no metadata.yaml' in bare.warnings[0]
-    assert_same(list(open_recording(whole / 'metadata.yaml').blocks()), expected)
+    assert_same(list(open_recording(complete_bag / 'metadata.yaml').blocks()), expected)
 
 
 @pytest.mark.slow
