@@ -68,7 +68,7 @@ class OwnClock:
 
     def advance(self, ns: int) -> None:
         with self._advancing:
-            self.now += ns
+            self.now += max(ns, 0)
 
     def monotonic_ns(self) -> int:
         return self.now
