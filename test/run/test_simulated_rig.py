@@ -95,7 +95,6 @@ def observed(loads: list[tuple[float, float, float]], seconds: float, lost: rang
     return recent
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('lost', [range(0), range(60, 80)])
 def test_the_last_step_is_found_to_a_tenth_of_a_block(lost: range) -> None:
     found = observed([(0, 0, 0), (0, -10, 0), (5, -10, 0)], 4.0, lost).step_ns()
