@@ -12,18 +12,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.base.log import texts
-from psd_deflection.devices.protocol.frames import (
-    GoodFrame,
-    HelloFrame,
-    HelloRequestFrame,
-    PingFrame,
-    PongFrame,
-    SampleFrame,
-    StartFrame,
-    StatusFrame,
-    StopFrame,
-    encode,
-)
+from psd_deflection.devices.protocol import frames
 from psd_deflection.devices.protocol.text_lines import Description, Line, parse
 from psd_deflection.devices.registry import DEVICES
 from psd_deflection.records import DeflectionEstimate, SampleBlock
@@ -72,25 +61,25 @@ EMULATOR = Path(__file__).parent / 'second_device.py'
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'protocol.md'
 
 COOKIE = 0x0102030405060708
-EXAMPLES: list[GoodFrame] = [
-    HelloRequestFrame(),
-    StartFrame(),
-    StopFrame(),
-    PingFrame(COOKIE),
-    PongFrame(COOKIE, 1_000_000),
-    StatusFrame(3, 2150),
-    StatusFrame(0, None),
-    SampleFrame(0, 1, 1000, (0, -1, 16384, 256, -32768, 16384)),
-    SampleFrame(3, 0, 0, (32767, 0, 16384, 0, 0, 16384)),
-    HelloFrame(1, {'serial': 'A1'}),
+EXAMPLES: list[frames.GoodFrame] = [
+    frames.HelloRequestFrame(),
+    frames.StartFrame(),
+    frames.StopFrame(),
+    frames.PingFrame(COOKIE),
+    frames.PongFrame(COOKIE, 1_000_000),
+    frames.StatusFrame(3, 2150),
+    frames.StatusFrame(0, None),
+    frames.SampleFrame(0, 1, 1000, (0, -1, 16384, 256, -32768, 16384)),
+    frames.SampleFrame(3, 0, 0, (32767, 0, 16384, 0, 0, 16384)),
+    frames.HelloFrame(1, {'serial': 'A1'}),
 ]
-WIDE = SampleFrame(0, 1, 1000, (8388607, -1, 4194304, 256, -8388608, 4194304))
+WIDE = frames.SampleFrame(0, 1, 1000, (8388607, -1, 4194304, 256, -8388608, 4194304))
 
 
 def test_the_page_and_the_code_say_the_same_bytes() -> None:
     on_the_page = [bytes.fromhex(h) for h in re.findall(r'\| `((?:[0-9a-f]{2})+00)` \|', PAGE.read_text())]
-    sent = [encode(frame) for frame in EXAMPLES]
-    sent.insert(-1, encode(WIDE, wide=True))
+    sent = [frames.encode(frame) for frame in EXAMPLES]
+    sent.insert(-1, frames.encode(WIDE, wide=True))
     assert on_the_page == sent
 
 

@@ -17,19 +17,7 @@ from psd_deflection.devices import PowerUp
 from psd_deflection.devices import serve as module
 from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.device import converter_parameters
-from psd_deflection.devices.protocol.frames import (
-    Frame,
-    FrameDecoder,
-    HelloFrame,
-    HelloRequestFrame,
-    PingFrame,
-    PongFrame,
-    SampleFrame,
-    StartFrame,
-    StatusFrame,
-    StopFrame,
-    encode,
-)
+from psd_deflection.devices.protocol import frames
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal, link_names, open_terminals
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.replay import Pacer, Replay
@@ -61,21 +49,21 @@ def device(
     return SimulatedFrames(feed, PowerUp(skew_ppm, first_seq), lose=lose)
 
 
-def frames(stream: bytes) -> list[Frame]:
-    return FrameDecoder().feed(b'\x00' + stream)
+def decoded(stream: bytes) -> list[frames.Frame]:
+    return frames.FrameDecoder().feed(b'\x00' + stream)
 
 
-def samples(stream: bytes) -> list[SampleFrame]:
-    return [f for f in frames(stream) if isinstance(f, SampleFrame)]
+def samples(stream: bytes) -> list[frames.SampleFrame]:
+    return [f for f in decoded(stream) if isinstance(f, frames.SampleFrame)]
 
 
 def test_device_sends_samples_at_1khz_and_hello_at_1hz() -> None:
-    got = frames(device().take(2500 * MS, room=1 << 30))
-    taken = [f for f in got if isinstance(f, SampleFrame)]
+    got = decoded(device().take(2500 * MS, room=1 << 30))
+    taken = [f for f in got if isinstance(f, frames.SampleFrame)]
     assert [f.seq for f in taken] == list(range(2501))
     assert all(f.t_device_us == 1000 * f.seq for f in taken)
-    assert sum(isinstance(f, StatusFrame) for f in got) == 3
-    hellos = [f for f in got if isinstance(f, HelloFrame)]
+    assert sum(isinstance(f, frames.StatusFrame) for f in got) == 3
+    hellos = [f for f in got if isinstance(f, frames.HelloFrame)]
     assert len(hellos) == 3
     assert hellos[0].version == 1
     assert hellos[0].info['channels'] == list(CHANNELS)
@@ -94,12 +82,12 @@ def test_it_sends_the_same_however_often_it_is_asked() -> None:
 
 def test_it_answers_hello_and_ping_and_stops_and_starts() -> None:
     d = device(first_seq=1000)
-    (hello,) = frames(d.receive(encode(HelloRequestFrame()), 0))
-    assert isinstance(hello, HelloFrame)
-    assert frames(d.receive(encode(PingFrame(77)), 250 * MS)) == [PongFrame(77, 1_250_000)]
-    d.receive(encode(StopFrame()), 0)
+    (hello,) = decoded(d.receive(frames.encode(frames.HelloRequestFrame()), 0))
+    assert isinstance(hello, frames.HelloFrame)
+    assert decoded(d.receive(frames.encode(frames.PingFrame(77)), 250 * MS)) == [frames.PongFrame(77, 1_250_000)]
+    d.receive(frames.encode(frames.StopFrame()), 0)
     assert not samples(d.take(100 * MS))
-    d.receive(encode(StartFrame()), 0)
+    d.receive(frames.encode(frames.StartFrame()), 0)
     assert samples(d.take(101 * MS))[0].seq == 1101
     assert d.receive(b'rubbish\x00', 0) == b''
 
@@ -109,8 +97,8 @@ def test_samples_without_room_are_dropped_counted_and_flagged() -> None:
     d.take(100 * MS, room=0)
     got = samples(d.take(102 * MS))
     assert [(f.seq, f.flags) for f in got] == [(101, 2), (102, 0)]
-    late = frames(d.take(1000 * MS, room=1 << 30))
-    assert [f.overruns for f in late if isinstance(f, StatusFrame)] == [101]
+    late = decoded(d.take(1000 * MS, room=1 << 30))
+    assert [f.overruns for f in late if isinstance(f, frames.StatusFrame)] == [101]
 
 
 def test_its_number_wraps_and_its_clock_runs_on() -> None:
@@ -157,9 +145,9 @@ def test_a_process_that_wakes_late_catches_up_and_drops_nothing(monkeypatch: pyt
     d = device()
     line = Taking()
     serve(d, line, lambda: d.taken > 1000)
-    got = frames(line.taken)
-    assert [f.seq for f in got if isinstance(f, SampleFrame)] == list(range(d.taken))
-    assert {f.overruns for f in got if isinstance(f, StatusFrame)} == {0}
+    got = decoded(line.taken)
+    assert [f.seq for f in got if isinstance(f, frames.SampleFrame)] == list(range(d.taken))
+    assert {f.overruns for f in got if isinstance(f, frames.StatusFrame)} == {0}
 
 
 def test_a_link_replaces_a_link_and_nothing_else(tmp_path: Path) -> None:
@@ -192,14 +180,14 @@ def test_pair_ports_have_own_links_and_fail_together(tmp_path: Path) -> None:
 
 def test_a_converter_of_24_bits_sends_wide_samples_and_says_so() -> None:
     rig = load_rig(overrides={'converter.bits': 24})
-    got = frames(SimulatedFrames(RigFeed(rig, no_load)).take(500 * MS, room=1 << 30))
-    hello = next(f for f in got if isinstance(f, HelloFrame))
+    got = decoded(SimulatedFrames(RigFeed(rig, no_load)).take(500 * MS, room=1 << 30))
+    hello = next(f for f in got if isinstance(f, frames.HelloFrame))
     assert converter_parameters(hello.info) == {
         'converter.sample_rate_hz': 1000.0,
         'converter.bits': 24,
         'converter.full_scale': 10.0,
     }
-    volts = np.array([f.counts for f in got if isinstance(f, SampleFrame)]) * rig.converter.volts_per_count
+    volts = np.array([f.counts for f in got if isinstance(f, frames.SampleFrame)]) * rig.converter.volts_per_count
     assert volts.shape == (501, 6)
     assert np.abs(volts.mean(axis=0) - [0.0, 0.0, 5.0, 0.0, 0.0, 5.0]).max() < 5e-4
     # The noise of 2 mV is a handful of steps of 16 bits, and thousands of 24.

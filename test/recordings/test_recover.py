@@ -378,6 +378,15 @@ def test_a_chunk_that_declares_too_much_is_not_unpacked(tmp_path: Path, complete
         assert str(size) in recording.warnings[0]
 
 
+def test_an_index_that_declares_too_much_ends_the_file(tmp_path: Path, complete: bytes) -> None:
+    at = next(at for op, at, length in top_level(complete) if op == 7)
+    spoiled = complete[: at - 1] + b'\x80' + complete[at:]
+    (tmp_path / 'a.mcap').write_bytes(spoiled)
+    recording = BagRecording(tmp_path / 'a.mcap')
+    assert [b.index for b in recording.blocks()] == list(range(25))
+    assert f'ends at byte {at - 9} before its end' in recording.warnings[0]
+
+
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.floats(0, 1), st.binary(min_size=1, max_size=12)), min_size=1, max_size=4))
 def test_no_damage_ends_in_a_traceback(tmp_path: Path, changes: list[tuple[float, bytes]]) -> None:

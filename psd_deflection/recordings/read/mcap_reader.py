@@ -190,7 +190,7 @@ class McapReader:
             opcode, length, number = _INDEX_HEAD.unpack(head)
             if opcode != Opcode.MESSAGE_INDEX:
                 return named > 0
-            if number in wanted or number not in self._channels:
+            if number in wanted or number not in self._channels or length > self._size:
                 return False
             named += 1
             at += RECORD_HEAD.size + length
