@@ -16,7 +16,7 @@ from bench.simulated_arm import SimulatedArm, largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm
-from psd_deflection.arms.compensation.compensator import UNVERIFIED, Command, Compensator, Observed, State
+from psd_deflection.arms.compensation.compensator import FOREIGN_S, UNVERIFIED, Command, Compensator, Observed, State
 from psd_deflection.arms.compensation.response import JointResponse
 from psd_deflection.arms.compensation.settings import SETTINGS, SHAPING, CompensatorSettings, ShaperSettings, shaper_of
 from psd_deflection.base.errors import ConfigError
@@ -125,7 +125,10 @@ def test_dry_it_proposes_what_it_would_command(arm: Arm) -> None:
     dry, wet = Loop(arm, dry=True), Loop(arm)
     for loop in (dry, wet):
         loop.plant.force = PAYLOAD
+        loop.run(PERIOD)
         loop.compensator.enable(True)
+        # What came before is not judged.
+        assert math.isnan(loop.send(loop.t).residual)
         loop.run(1.6)
     assert dry.offsets == pytest.approx(wet.offsets, rel=0.05)
     assert dry.error() > 30 * wet.error()
@@ -342,6 +345,14 @@ def test_modes_are_those_of_the_rig_file(tmp_path: Path) -> None:
     assert shaper_of(chosen) == (shaper('zvd', 13.5, 0.03), words)
 
 
+def test_what_the_controller_tells_is_in_words_for_a_while(arm: Arm) -> None:
+    compensator = Compensator(arm, CompensatorSettings())
+    assert compensator.controller_text(0.0) == 'nothing'
+    compensator.controller_has(0.0, np.array([0.1, -2e-6]))
+    assert compensator.controller_text(FOREIGN_S) == '0.100000, -0.000002'
+    assert compensator.controller_text(math.nextafter(FOREIGN_S, math.inf)) == 'nothing'
+
+
 def test_before_the_first_deflection_there_is_no_offset(arm: Arm) -> None:
     compensator = Compensator(arm, CompensatorSettings())
     compensator.enable(True)
@@ -457,6 +468,14 @@ def test_slope_is_known_0_2_s_after_joint_and_offset_rest(period: float, first: 
         response.add(period * n, moved, moved, 0.01)
         known.append(bool(response.known()[0]))
     assert known.index(True) == first
+
+
+def test_a_motion_before_the_first_rest_says_nothing() -> None:
+    response = JointResponse(1)
+    for n in range(100):
+        moved = np.array([0.02 * min(n / 10, 1.0)])
+        response.add(0.02 * n, moved, moved, 0.01)
+    assert not response.known()[0]
 
 
 @pytest.mark.parametrize(('late', 'wrong'), [(0, 1), (24, 1), (26, None)])
