@@ -99,6 +99,8 @@ def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
     )
     np.testing.assert_allclose(second.at(at)[:, 0], wanted, atol=2e-3)
     assert np.array_equal(second.states[-1, 0], [0.0, 0.0])
+    # The middle of the first, at 0.25 s, was not reached.
+    assert np.abs(second.times - 0.05).min() > 5e-3
 
 
 def test_points_of_twice_replaced_trajectory_are_kept() -> None:
