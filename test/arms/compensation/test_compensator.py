@@ -127,7 +127,7 @@ def test_dry_it_proposes_what_it_would_command(arm: Arm) -> None:
         loop.plant.force = PAYLOAD
         loop.run(PERIOD)
         loop.compensator.enable(True)
-        # What came before is not judged.
+        # Estimates from before it was enabled have no residual.
         assert math.isnan(loop.send(loop.t).residual)
         loop.run(1.6)
     assert dry.offsets == pytest.approx(wet.offsets, rel=0.05)
@@ -345,7 +345,7 @@ def test_modes_are_those_of_the_rig_file(tmp_path: Path) -> None:
     assert shaper_of(chosen) == (shaper('zvd', 13.5, 0.03), words)
 
 
-def test_what_the_controller_tells_is_in_words_for_a_while(arm: Arm) -> None:
+def test_controller_text_expires(arm: Arm) -> None:
     compensator = Compensator(arm, CompensatorSettings())
     assert compensator.controller_text(0.0) == 'nothing'
     compensator.controller_has(0.0, np.array([0.1, -2e-6]))
@@ -470,7 +470,7 @@ def test_slope_is_known_0_2_s_after_joint_and_offset_rest(period: float, first: 
     assert known.index(True) == first
 
 
-def test_a_motion_before_the_first_rest_says_nothing() -> None:
+def test_motion_before_first_rest_gives_no_slope() -> None:
     response = JointResponse(1)
     for n in range(100):
         moved = np.array([0.02 * min(n / 10, 1.0)])
