@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import SOLVERS, SolverStatus, make_solver, solver_from_rig
@@ -98,6 +99,26 @@ def test_solver_cache_between_blocks_changes_no_answer(golden: Any, method: str,
         with contextlib.suppress(ValueError):
             gain[:] = 7.0
         np.testing.assert_array_equal(solver.gain(dots, variances, got), fresh.gain(dots, variances, want))
+
+
+@pytest.mark.parametrize('psds', [2, 3])
+@pytest.mark.parametrize('method', ['exact', 'wls', 'iterative'])
+def test_one_block_and_many_have_the_same_bits(method: str, psds: int) -> None:
+    """Their gains too. Of two PSDs the last block's plate points coincide, so that nothing says how it is turned."""
+    rng = np.random.default_rng(psds)
+    centers = rng.uniform(-0.1, 0.1, (psds, 2))
+    solver = make_solver(method, Geometry(centers, np.full((psds, 2), 1e-3), np.zeros(psds), 0.585, arithmetic=FIXED))
+    dots = rng.normal(size=(30, 2 * psds)) * rng.choice([1e-6, 1e-3, 2e-2], (30, 1))
+    if psds == 2:
+        dots[-1] = (-centers).ravel()
+    for variances in ((4e-12,) * 2 * psds, tuple((rng.uniform(1.0, 9.0, 2 * psds) * 1e-12).tolist())):
+        many = solver.solve_many(dots, np.array(variances))
+        gains = solver.gain_many(dots[:-1], variances, solver.solve_many(dots[:-1], np.array(variances)))
+        for i, (own, row) in enumerate(zip(dots.tolist(), many.rows(), strict=True)):
+            one = solver.solve(tuple(own), variances)
+            assert repr(one._replace(iterations=0)) == repr(row)
+            if i < 29:
+                np.testing.assert_array_equal(solver.gain(tuple(own), variances, one), gains[i])
 
 
 @pytest.mark.parametrize(('method', 'options'), SMOOTH)
