@@ -390,7 +390,7 @@ class Pipeline:
         """The dots of each block, and whether lasers and detectors are sound."""
         frozen = self._stillness.blocks
         size = self._cutter.block_size
-        seq, t_ns = np.stack([block.seq for block in blocks]), np.stack([block.t_ns for block in blocks])
+        seq, t_ns = np.array([block.seq for block in blocks]), np.array([block.t_ns for block in blocks])
         middles = middles_ns(seq, t_ns, size, self._period_ns)
         for block, own, slots, middle in zip(blocks, measures, seq % size, middles, strict=True):
             frozen = self._optics.frozen(frozen, own)

@@ -82,59 +82,53 @@ class ReadingsRun:
         return self._answers[number][at]
 
     def _solve(self, numbers: Iterable[int]) -> None:
-        gained: dict[int, tuple[list[Solution], list[bool], FloatArray, Solver]] = {}
+        found: list[tuple[int, Solver, list[Solution], FloatArray]] = []
         for number in numbers:
             solver = self._solvers.of(number, self.psds.psds)
             if solver is None:
                 failed = SolverAnswer(None, f'{self._solvers.names[number]}: takes all PSDs')
                 self._answers[number] = [failed] * len(self.dots)
             else:
-                gained[number] = (*self._solutions(solver), solver)
-        if not gained:
+                found.append((number, solver, *self._solutions(solver)))
+        if not found:
             return
-        gains = np.array([gain for _, _, gain, _ in gained.values()])
+        gains = np.array([own for *_, own in found])
         # Of all solvers at once: of so few numbers the calls cost most.
         noises = FIXED.einsum('sbic,bck,sbjk->sbij', gains, self.covariance, gains)
-        for (number, (solutions, known, gain, solver)), noise in zip(gained.items(), noises, strict=True):
-            rows = zip(self.dots, solutions, known, gain, noise, strict=True)
-            self._answers[number] = [self._answer(number, solver, *row) for row in rows]
+        for (number, solver, solutions, gain), noise in zip(found, noises, strict=True):
+            self._answers[number] = [
+                self._answer(number, solver, at, solution, gain[at], noise[at]) for at, solution in enumerate(solutions)
+            ]
 
-    def _solutions(self, solver: Solver) -> tuple[list[Solution], list[bool], FloatArray]:
-        """The solutions, which of them have a gain, and the gains (B, 3, C), 0 of the others."""
-        count, variances = len(self.dots), self.variances
-        if count > 1:
-            dots = np.array(self.dots)
-            found = solver.solve_many(dots, np.array(variances))
-            solutions = found.rows()
-            known = [_has_gain(solution) for solution in solutions]
-            if all(known):
-                return solutions, known, solver.gain_many(dots, variances, found)
-        else:
-            solutions = [solver.solve(self.dots[0], variances)]
-            known = [_has_gain(solutions[0])]
-        gains = np.zeros((count, 3, len(variances)))
-        for i, (own, solution) in enumerate(zip(self.dots, solutions, strict=True)):
-            if known[i]:
-                gains[i] = solver.gain(own, variances, solution)
-        return solutions, known, gains
+    def _solutions(self, solver: Solver) -> tuple[list[Solution], FloatArray]:
+        """The solutions and their gains (B, 3, C), 0 of those without."""
+        variances = self.variances
+        if len(self.dots) == 1:
+            one = solver.solve(self.dots[0], variances)
+            return [one], self._gain(solver, 0, one)[None]
+        dots = np.array(self.dots)
+        found = solver.solve_many(dots, np.array(variances))
+        solutions = found.rows()
+        if all(map(_has_gain, solutions)):
+            return solutions, solver.gain_many(dots, variances, found)
+        return solutions, np.array([self._gain(solver, at, one) for at, one in enumerate(solutions)])
+
+    def _gain(self, solver: Solver, at: int, solution: Solution) -> FloatArray:
+        """(3, C): of a solution of block ``at``, 0 if it has none."""
+        if _has_gain(solution):
+            return solver.gain(self.dots[at], self.variances, solution)
+        return np.zeros((3, len(self.variances)))
 
     def _answer(
-        self,
-        number: int,
-        solver: Solver,
-        dots: Dots,
-        solution: Solution,
-        known: bool,
-        gain: FloatArray,
-        noise: FloatArray,
+        self, number: int, solver: Solver, at: int, solution: Solution, gain: FloatArray, noise: FloatArray
     ) -> SolverAnswer:
         if solution.status is not SolverStatus.OK:
             return SolverAnswer(
                 None, f'{self._solvers.names[number]}: {solution.status.name.lower().replace("_", " ")}'
             )
-        if not known:
+        if not _has_gain(solution):
             return SolverAnswer(solution)
-        allowance = solver.allowance(dots, self.variances)
+        allowance = solver.allowance(self.dots[at], self.variances)
         return SolverAnswer(solution, '', gain, noise if allowance is None else noise + allowance)
 
 
