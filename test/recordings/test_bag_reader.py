@@ -653,7 +653,9 @@ def test_a_file_that_metadata_do_not_list_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('leap_s', [-3600.0, 12.0, 1.7e9])
-def test_a_leap_of_log_times_is_reported_once(tmp_path: Path, leap_s: float) -> None:
+def test_a_leap_of_log_times_is_reported_once(
+    tmp_path: Path, leap_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         for record in RECORDS:
             leapt = int(leap_s * 1e9) if record.index >= 20 else 0
@@ -666,3 +668,5 @@ def test_a_leap_of_log_times_is_reported_once(tmp_path: Path, leap_s: float) -> 
     (warning,) = recording.warnings
     assert f"the recorder's clock leapt by {leap_s:+.3f} s" in warning
     assert np.diff(recording.samples['t']).max() < 0.0011
+    assert main(['recover', recording.path.as_posix()]) == 0
+    assert " 0.780 s; was intact; the recorder's clock leapt, " in capsys.readouterr().out

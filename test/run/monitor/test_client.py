@@ -45,6 +45,9 @@ def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest
     assert serving.shown.agos == [0.0, 0.0, 3.4, None]
     assert main(['mark', 'bumped', 'it']) == 0
     assert serving.shown.marks == ['bumped it']
+    # Four loads and a mark, of the time at which this program was started.
+    assert len(serving.shown.lates) == 5
+    assert 0.0 < serving.shown.lates[0] < serving.shown.lates[-1]
     assert serving.shown.zeros == 1
     assert serving.shown.recordings == ['recordings/test', None]
     assert serving.shown.loads[:2] == [(0.0, -10.0, 0.5, False), (-10.0, 0.0, 0.0, True)]
