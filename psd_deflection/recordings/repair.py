@@ -25,7 +25,7 @@ from psd_deflection.recordings.mcap_format import (
     Metadata,
     Schema,
 )
-from psd_deflection.recordings.read.bag_reader import LEAP_NS, files_in, read_information
+from psd_deflection.recordings.read.bag_reader import files_in, read_information
 from psd_deflection.recordings.read.mcap_reader import McapReader
 from psd_deflection.recordings.write.bag_metadata import (
     DEFAULT_QOS,
@@ -44,14 +44,13 @@ _MAX_QOS_TEXT = 10_000
 
 @dataclass(slots=True)
 class RecoveredFile:
-    """One file: its content now; ``repaired``: whether it needed repair; ``span_ns``: duration, of the samples where
-    there are any; ``leapt``: whether the recorder's clock leapt; ``warnings`` of the reading."""
+    """One file: its content now; ``repaired``: whether it needed repair; ``span_ns``: duration, by the stamps of the
+    samples where there are any; ``warnings`` of the reading."""
 
     path: Path
     repaired: bool
     count: FileCount
     span_ns: int
-    leapt: bool
     topics: list[TopicCount]
     warnings: list[str] = field(default_factory=list)
 
@@ -97,8 +96,6 @@ class _Copy:
         self.messages = 0
         self.start = self.end = 0
         self.stamps: tuple[int, int] | None = None
-        self.leapt = False
-        self._late = 0
 
     def add(self, record: McapRecord) -> None:
         if isinstance(record, McapMessage):
@@ -125,7 +122,9 @@ class _Copy:
         self.end = max(self.end, m.log_time)
         self.messages += 1
         if channel.topic.endswith(SAMPLES) and len(m.data) >= cdr.FRAME_AT:
-            self._take_stamp(cdr.header_stamp_ns(m.data), m.log_time)
+            stamp = cdr.header_stamp_ns(m.data)
+            low, high = self.stamps or (stamp, stamp)
+            self.stamps = (min(low, stamp), max(high, stamp))
         writer = self._writer
         if writer is None:
             return
@@ -141,12 +140,6 @@ class _Copy:
             self._first = None
         self._first = m.log_time if self._first is None else self._first
         writer.add_message(self._numbers[m.channel_id], m.log_time, m.data, m.publish_time, m.sequence)
-
-    def _take_stamp(self, stamp: int, log_time: int) -> None:
-        self.leapt |= self.stamps is not None and abs(log_time - stamp - self._late) > LEAP_NS
-        self._late = log_time - stamp
-        low, high = self.stamps or (stamp, stamp)
-        self.stamps = (min(low, stamp), max(high, stamp))
 
     def finish(self) -> None:
         if self._writer is None or self._stream is None:
@@ -165,7 +158,7 @@ class _Copy:
 def _recover_file(path: Path) -> RecoveredFile:
     source = McapReader(path)
     if path.stat().st_size <= len(MAGIC):
-        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), 0, False, [], source.warnings)
+        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), 0, [], source.warnings)
     cut = source.cut_at is not None
     partial = path.with_name(path.name + '.partial')
     partial.unlink(missing_ok=True)
@@ -190,7 +183,7 @@ def _recover_file(path: Path) -> RecoveredFile:
             raise
         partial.rename(path)
     first, last = copy.stamps or (copy.start, copy.end)
-    return RecoveredFile(path, cut, count, last - first, copy.leapt, list(copy.topics.values()), source.warnings)
+    return RecoveredFile(path, cut, count, last - first, list(copy.topics.values()), source.warnings)
 
 
 def _set_aside(path: Path) -> Path:

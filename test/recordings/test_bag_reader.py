@@ -669,4 +669,4 @@ def test_a_leap_of_log_times_is_reported_once(
     assert f"the recorder's clock leapt by {leap_s:+.3f} s" in warning
     assert np.diff(recording.samples['t']).max() < 0.0011
     assert main(['recover', recording.path.as_posix()]) == 0
-    assert " 0.780 s; was intact; the recorder's clock leapt, " in capsys.readouterr().out
+    assert ' 0.780 s; was intact' in capsys.readouterr().out

@@ -53,7 +53,6 @@ def in_json(done: Recovered) -> dict[str, Any]:
                 'start_ns': file.count.start_ns,
                 'end_ns': file.count.end_ns,
                 'span_s': file.span_ns * 1e-9,
-                'leapt': file.leapt,
                 'warnings': file.warnings,
             }
             for file in done.files
@@ -66,8 +65,7 @@ def in_json(done: Recovered) -> dict[str, Any]:
 def _lines(path: str, done: Recovered) -> Iterator[str]:
     for file in done.files:
         what = f'repaired, the old one is {file.path.name}.cut' if file.repaired else 'was intact'
-        leapt = "; the recorder's clock leapt, the samples keep their own times" if file.leapt else ''
-        yield f'{file.path}: {file.count.messages} messages, {file.span_ns * 1e-9:.3f} s; {what}{leapt}'
+        yield f'{file.path}: {file.count.messages} messages, {file.span_ns * 1e-9:.3f} s; {what}'
     for aside in done.set_aside:
         yield f'{aside}: held nothing and is set aside'
     if done.metadata_written:
