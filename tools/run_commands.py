@@ -30,6 +30,7 @@ from tools.tasks import SHORTEST_BENCH, TASKS, install
 
 WAIT_S = 1200.0
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+NOTEBOOKS = sorted((ROOT / 'docs').glob('*.ipynb'))
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
 INLINE = re.compile(r'`((?:make|psd-deflection|python|python3|pip|apt|sudo|colcon|ros2) [^`\n]+)`')
 SPOKEN_OF = re.compile(r'(psd-deflection (NAME|[a-z-]+)|ros2 [a-z]+( [a-z]+)?)$')
@@ -193,8 +194,12 @@ BASE = ('ros', 'monitor', 'plot')
 
 
 def python_of(page: str, folder: Path) -> list[str]:
-    """Lines that run each Python block of ``page``, its sessions with their answers, and its notebooks."""
+    """Lines that run each Python block of ``page`` and its sessions with their answers, or the cells of a notebook."""
     text, lines, session = (ROOT / page).read_text(encoding='utf-8'), [], ''
+    if page.endswith('.ipynb'):
+        code = [''.join(cell['source']) for cell in json.loads(text)['cells'] if cell['cell_type'] == 'code']
+        (folder / 'notebook.py').write_text('\n'.join(code), encoding='utf-8')
+        return ['python notebook.py']
     for number, fence in enumerate(FENCE.finditer(text)):
         if fence['kind'] == 'pycon':
             session += fence['text'] + '\n'
@@ -204,11 +209,6 @@ def python_of(page: str, folder: Path) -> list[str]:
     if session:
         (folder / 'session.txt').write_text(session, encoding='utf-8')
         lines.append('python -m doctest -o ELLIPSIS -o NORMALIZE_WHITESPACE session.txt')
-    for name in re.findall(r'\]\((\w+\.ipynb)\)', text):
-        cells = json.loads((ROOT / page).with_name(name).read_text(encoding='utf-8'))['cells']
-        code = '\n'.join(''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code')
-        (folder / 'notebook.py').write_text(code, encoding='utf-8')
-        lines.append('python notebook.py')
     return lines
 
 
@@ -463,7 +463,7 @@ def main() -> int:
             return lines
 
         at_first = {*folder.iterdir(), folder / DEVICE}
-        blocks: dict[str, list[list[Command]]] = {str(page.relative_to(ROOT)): [] for page in PAGES}
+        blocks: dict[str, list[list[Command]]] = {str(page.relative_to(ROOT)): [] for page in (*PAGES, *NOTEBOOKS)}
         for block in blocks_to_run():
             blocks[block[0].page].append(block)
         try:

@@ -31,7 +31,8 @@ ALL = list(run_commands.commands())
 
 def test_there_are_commands_and_python_blocks(tmp_path: Path) -> None:
     assert sum(c.line.startswith('psd-deflection ') for c in ALL) > 40
-    python = [line for page in PAGES for line in run_commands.python_of(str(page.relative_to(ROOT)), tmp_path)]
+    every = (*PAGES, *run_commands.NOTEBOOKS)
+    python = [line for page in every for line in run_commands.python_of(str(page.relative_to(ROOT)), tmp_path)]
     assert len(python) > 9
     assert 'python notebook.py' in python
     assert {'README.md', 'docs/quickstart.md', 'docs/monitor.md', 'docs/security.md'} <= {c.page for c in ALL}
@@ -46,12 +47,14 @@ def test_every_command_is_run() -> None:
 
 
 def test_a_page_has_what_its_lines_of_pip_add() -> None:
-    found = {str(page.relative_to(ROOT)): run_commands.extras_of(str(page.relative_to(ROOT))) for page in PAGES}
+    names = [str(page.relative_to(ROOT)) for page in (*PAGES, *run_commands.NOTEBOOKS)]
+    found = {name: run_commands.extras_of(name) for name in names}
     assert {page: wanted for page, wanted in found.items() if wanted} == {
         'docs/api.md': ['pandas>=2.1', 'xarray>=2024.1'],
         'docs/commands.md': ['shtab'],
         'docs/camera.md': ['opencv-python-headless>=4.6'],
         'docs/first-day.md': ['pandas'],
+        'docs/recording.ipynb': ['pandas>=2.1', 'xarray>=2024.1'],
         'docs/fleet.md': ['distributed>=2024.1', 'pyarrow>=15'],
     }
 

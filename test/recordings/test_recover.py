@@ -231,6 +231,7 @@ def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
         fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
+@pytest.mark.foreign
 @pytest.mark.parametrize(
     'text',
     [
