@@ -125,9 +125,11 @@ def test_only_recorded_parameters_are_reported_as_defaults(tmp_path: Path, capsy
     for values, heading in (({**rig, 'degraded': 'off'}, 'all'), (links, 'the recorded')):
         with BagWriter(tmp_path / heading, rig_values=values) as out:
             out.put(block(0))
+            out.put(ParameterChange(T0, 0, (('state.noise', (0.125,) * 60),)))
         assert main(['info', str(tmp_path / heading)]) == 0
         text = capsys.readouterr().out
         assert f'  {heading} parameters at their defaults' in text
+        assert '0.125' not in text
         assert (f'{len(rig) - len(links)} parameters of a rig are not in the recording' in text) == (values is links)
 
 

@@ -8,7 +8,6 @@
 import configparser
 import json
 import os
-import pydoc
 import re
 import shutil
 import subprocess
@@ -106,6 +105,13 @@ QUESTIONS = {
     'A PSD is mirrored: what now?': ('calibration.md', 'mirrored'),
     'How is a recording computed with another rig file?': ('recording.md', '--params-file'),
     'What does ± mean?': ('accuracy.md', '# Accuracy: what ±'),
+    'Which converter shall I buy?': ('hardware.md', '## Which converter'),
+    'Is my NI or LabJack supported?': ('devices/replay.md', 'LabJack (T7, U6), MCC, NI (USB-6009'),
+    'How long must lasers warm up, and does a zero outlive a restart?': ('calibration.md', 'also after restarts'),
+    'How do I hang the link on my robot?': ('topics.md', 'psd_link.urdf.xacro'),
+    'How is the last week kept?': ('recording.md', '`bag_keep`'),
+    'What does hum of 50 Hz do to ±?': ('devices/README.md', 'averages 50 Hz hum'),
+    'Does it run on Kilted?': ('quickstart.md', 'ros-kilted-rclpy'),
     'How is a load noted?': ('monitor.md', 'psd-deflection load 0 -10 0'),
     'Why is there no estimate without a laser?': ('troubleshooting.md', '| laser lost |'),
     'How do estimates get into pandas?': ('api.md', 'to_pandas()'),
@@ -158,12 +164,6 @@ def test_every_page_is_once_in_the_menu() -> None:
     assert sorted(menu) == sorted(
         str(page.relative_to(ROOT / 'docs')) for page in PAGES if page.name != 'README.md' or page.parent != ROOT
     )
-
-
-def test_what_the_page_of_python_shows_is_there() -> None:
-    names = re.findall(r'^::: (\S+)$', (ROOT / 'docs' / 'api.md').read_text(), re.M)
-    assert len(names) > 10
-    assert [name for name in names if pydoc.locate(name) is None] == []
 
 
 def test_the_pages_are_short() -> None:

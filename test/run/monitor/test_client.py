@@ -67,6 +67,13 @@ def test_a_rejection_is_an_error_with_its_reason(serve: Serve, capsys: pytest.Ca
     assert capsys.readouterr().err == f'psd-deflection zero: {serving.url}: not zeroed: no data flows\n'
 
 
+@pytest.mark.parametrize('command', ['zero', 'mark', 'load', 'record', 'echo'])
+def test_what_speaks_to_a_daemon_starts_without_scipy(command: str) -> None:
+    code = f'from psd_deflection.cli.main import make_parser; make_parser([{command!r}])'
+    code += f'; import psd_deflection.cli.run.{command}, sys; sys.exit("scipy" in sys.modules)'
+    assert subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=False).returncode == 0
+
+
 def test_zero_waits_for_a_link_that_moves(
     serve: Serve, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
