@@ -126,7 +126,6 @@ QUESTIONS = {
     'Does it run on Windows or on a Mac?': ('quickstart.md', '**Windows and macOS**'),
     'Does it run on a Raspberry Pi?': ('quickstart.md', 'Raspberry Pi'),
     'How is it updated, and what becomes of old recordings?': ('quickstart.md', '## Updating'),
-    'How is it cited?': ('quickstart.md', 'CITATION.cff'),
     'How does MATLAB read a recording?': ('recording.md', 'ros2bagreader'),
     'How is a device behind a network connected?': ('devices/network.md', 'socket://'),
     'How is a bump marked?': ('first-month.md', 'psd-deflection mark'),

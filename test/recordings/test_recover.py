@@ -98,15 +98,6 @@ def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(
         assert (folder / 'run_0.mcap.cut').stat().st_size == int(part * len(content))
 
 
-def test_recover_reports_its_work_and_keeps_complete_files(
-    full: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = {p.name: p.read_bytes() for p in full.iterdir()}
-    assert main(['recover', str(full)]) == 0
-    assert 'was intact' in capsys.readouterr().out
-    assert {p.name: p.read_bytes() for p in full.iterdir()} == before
-
-
 def test_recover_rewrites_missing_metadata_identically(full: Path, tmp_path: Path) -> None:
     folder = record(tmp_path / 'run')
     expected = yaml.safe_load((folder / 'metadata.yaml').read_text())
