@@ -16,25 +16,7 @@ from hypothesis import strategies as st
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices.dataq import SimulatedDataq
-from psd_deflection.devices.protocol.apt import (
-    INFO_REQUEST,
-    READINGS_REQUEST,
-    AptDecoder,
-    HardwareInfo,
-    QuadrantReadings,
-    encode_info,
-    encode_readings,
-    readings_of,
-)
-from psd_deflection.devices.protocol.dataq import (
-    MODELS,
-    VOLTS_PER_COUNT,
-    ScanDecoder,
-    command,
-    find_reply,
-    plan_rate,
-    scan_list,
-)
+from psd_deflection.devices.protocol import apt, dataq
 from psd_deflection.devices.protocol.frames import BadFrame
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.source import PortClosedError
@@ -49,7 +31,7 @@ X, Y = 8191 / 32767 * 10.0 * 2.0, -16384 / 32767 * 10.0 * 2.0
 
 def is_reply(reading: object) -> bool:
     return (
-        isinstance(reading, QuadrantReadings)
+        isinstance(reading, apt.QuadrantReadings)
         and reading.x == pytest.approx(X, rel=1e-4)
         and reading.y == pytest.approx(Y, rel=1e-4)
         and reading.total == pytest.approx(5.0, rel=1e-4)
@@ -57,41 +39,41 @@ def is_reply(reading: object) -> bool:
 
 
 def test_questions_and_answers_byte_by_byte() -> None:
-    assert bytes.fromhex('710803005001') == READINGS_REQUEST
-    assert bytes.fromhex('050000005001') == INFO_REQUEST
-    (reading,) = AptDecoder().feed(REPLY)
+    assert bytes.fromhex('710803005001') == apt.READINGS_REQUEST
+    assert bytes.fromhex('050000005001') == apt.INFO_REQUEST
+    (reading,) = apt.AptDecoder().feed(REPLY)
     assert is_reply(reading)
-    assert encode_readings(8191, -16384, 32768)[:14] == REPLY[:14]
-    (info,) = AptDecoder().feed(encode_info(69251980, 'KPA101'))
-    assert info == HardwareInfo(69251980, 'KPA101', '1.0.0')
-    assert len(encode_info(1, 'TQD001')) == 90
+    assert apt.encode_readings(8191, -16384, 32768)[:14] == REPLY[:14]
+    (info,) = apt.AptDecoder().feed(apt.encode_info(69251980, 'KPA101'))
+    assert info == apt.HardwareInfo(69251980, 'KPA101', '1.0.0')
+    assert len(apt.encode_info(1, 'TQD001')) == 90
 
 
 def test_the_info_of_an_aligner_byte_by_byte() -> None:
     """Serial number, model, type 16, firmware 1.0.0 from its last number on, notes, version, state, channels."""
     body = bytes.fromhex('0df4 2004') + b'KPA101\0\0' + bytes.fromhex('1000 00000100')
     body += b'simulated'.ljust(60, b'\0') + bytes.fromhex('0100 0000 0100')
-    assert encode_info(0x0420F40D, 'KPA101') == bytes.fromhex('0600 5400 81 50') + body
-    assert encode_info(1, 'KPA101-LONG')[10:18] == b'KPA101-L'
+    assert apt.encode_info(0x0420F40D, 'KPA101') == bytes.fromhex('0600 5400 81 50') + body
+    assert apt.encode_info(1, 'KPA101-LONG')[10:18] == b'KPA101-L'
     # What is not as long is none.
     short = bytes.fromhex('0600 5300 81 50') + body[:-1]
-    assert AptDecoder().feed(short) == [BadFrame('length does not fit the message', 89)]
+    assert apt.AptDecoder().feed(short) == [BadFrame('length does not fit the message', 89)]
 
 
 def test_ten_volts_are_the_whole_range() -> None:
-    assert readings_of(32767, -32767, 65535) == pytest.approx((10.0, -10.0, 10.0), rel=1e-12)
+    assert apt.readings_of(32767, -32767, 65535) == pytest.approx((10.0, -10.0, 10.0), rel=1e-12)
     # Half of the light: the same difference is twice as far out.
-    assert readings_of(16384, 0, 32768)[0] == pytest.approx(10.0 * (16384 / 32767) / (32768 / 65535), rel=1e-12)
+    assert apt.readings_of(16384, 0, 32768)[0] == pytest.approx(10.0 * (16384 / 32767) / (32768 / 65535), rel=1e-12)
 
 
 def test_what_is_no_reading_is_passed_over() -> None:
     other = bytearray(REPLY)
     other[6] = 4
-    assert [is_reply(m) for m in AptDecoder().feed(bytes(other) + REPLY)] == [True]
+    assert [is_reply(m) for m in apt.AptDecoder().feed(bytes(other) + REPLY)] == [True]
 
 
 def test_what_is_thrown_away_is_counted() -> None:
-    decoder = AptDecoder()
+    decoder = apt.AptDecoder()
     # Three bytes begin no header; five are too few for one.
     assert decoder.feed(bytes(8)) == []
     assert decoder.reset() == 8
@@ -101,11 +83,11 @@ def test_what_is_thrown_away_is_counted() -> None:
 
 
 def test_without_light_no_place_is_made_up() -> None:
-    assert readings_of(20000, -20000, 0) == QuadrantReadings(0.0, 0.0, 0.0)
-    assert readings_of(3, -3, 300)[:2] == (0.0, 0.0)
+    assert apt.readings_of(20000, -20000, 0) == apt.QuadrantReadings(0.0, 0.0, 0.0)
+    assert apt.readings_of(3, -3, 300)[:2] == (0.0, 0.0)
     # 0.05 V are 327.7 counts.
-    assert readings_of(3, -3, 327)[:2] == (0.0, 0.0)
-    assert readings_of(3, -3, 328)[:2] == pytest.approx((300 / 32767 / 0.05005, -300 / 32767 / 0.05005), rel=1e-4)
+    assert apt.readings_of(3, -3, 327)[:2] == (0.0, 0.0)
+    assert apt.readings_of(3, -3, 328)[:2] == pytest.approx((300 / 32767 / 0.05005, -300 / 32767 / 0.05005), rel=1e-4)
 
 
 STREAM = (
@@ -115,20 +97,20 @@ STREAM = (
 
 @given(st.lists(st.integers(0, len(STREAM)), max_size=30))
 def test_messages_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
-    decoder = AptDecoder()
+    decoder = apt.AptDecoder()
     places = sorted({0, len(STREAM), *cuts})
     got = [m for a, b in itertools.pairwise(places) for m in decoder.feed(STREAM[a:b])]
     assert [type(m) for m in got] == [
-        *(BadFrame, QuadrantReadings, QuadrantReadings, BadFrame, QuadrantReadings, QuadrantReadings),
+        *(BadFrame, apt.QuadrantReadings, apt.QuadrantReadings, BadFrame, apt.QuadrantReadings, apt.QuadrantReadings),
     ]
-    assert all(is_reply(m) for m in got if isinstance(m, QuadrantReadings))
+    assert all(is_reply(m) for m in got if isinstance(m, apt.QuadrantReadings))
     assert got[0] == BadFrame('no APT header', 3)
     assert got[3] == BadFrame('length does not fit the message', 8)
 
 
 @given(st.lists(st.binary(max_size=100), max_size=10))
 def test_garbage_raises_nothing_and_is_not_kept(pieces: list[bytes]) -> None:
-    decoder = AptDecoder()
+    decoder = apt.AptDecoder()
     for piece in pieces:
         decoder.feed(piece)
     decoder.reset()
@@ -244,7 +226,7 @@ def test_port_lost_during_read_raises_port_closed(pair: Any) -> None:
 def test_a_message_has_255_bytes_at_most(size: int, fits: bool) -> None:
     """One that is of no interest is passed over; what is longer is none."""
     other = struct.pack('<HHBB', 0x1234, size, 0x81, 0x50) + bytes(size)
-    got = AptDecoder().feed(other + REPLY)
+    got = apt.AptDecoder().feed(other + REPLY)
     assert is_reply(got[-1])
     assert got[:-1] == ([] if fits else [BadFrame('no APT header', len(other))])
 
@@ -255,12 +237,12 @@ COUNTS = (1, -2, 16384, 256, -32767, 16384)
 
 
 def test_ten_volts_are_half_of_16_bits() -> None:
-    assert VOLTS_PER_COUNT * 2**15 == 10.0
+    assert dataq.VOLTS_PER_COUNT * 2**15 == 10.0
 
 
 def test_commands_end_in_a_carriage_return() -> None:
-    assert command('srate 60000') == b'srate 60000\r'
-    assert scan_list(range(6)) == [
+    assert dataq.command('srate 60000') == b'srate 60000\r'
+    assert dataq.scan_list(range(6)) == [
         'slist 0 0', 'slist 1 1', 'slist 2 2', 'slist 3 3', 'slist 4 4', 'slist 5 5', 'slist 6 10',
     ]  # fmt: skip
 
@@ -279,7 +261,7 @@ def test_commands_end_in_a_carriage_return() -> None:
     ],
 )
 def test_a_reply_is_found_behind_scans_and_between_zeros(received: bytes, asked: str, reply: str | None) -> None:
-    assert find_reply(received, asked) == reply
+    assert dataq.find_reply(received, asked) == reply
 
 
 @given(
@@ -289,14 +271,14 @@ def test_a_reply_is_found_behind_scans_and_between_zeros(received: bytes, asked:
 )
 def test_no_reply_is_made_up_and_the_one_that_follows_is_found(pieces: list[bytes]) -> None:
     received = b''.join(pieces)
-    reply = find_reply(received, 'info 1')
+    reply = dataq.find_reply(received, 'info 1')
     if reply is not None:
         assert re.search(rb'info 1( [^\r]*)?\s*\r', received.replace(b'\x00', b''))
-    assert find_reply(received + b'\rinfo 1 2108\r', 'info 1') == '2108'
+    assert dataq.find_reply(received + b'\rinfo 1 2108\r', 'info 1') == '2108'
 
 
 def fed(stream: bytes, cuts: list[int]) -> list[Any]:
-    decoder = ScanDecoder()
+    decoder = dataq.ScanDecoder()
     places = sorted({0, len(stream), *(c % (len(stream) + 1) for c in cuts)})
     return [item for a, b in itertools.pairwise(places) for item in decoder.feed(stream[a:b])]
 
@@ -357,7 +339,7 @@ def test_garbage_raises_nothing_and_the_cuts_do_not_matter(junk: bytes, cuts: li
     ],
 )
 def test_the_rate_is_laid_out_from_the_clock(model: str, hz: float, per_channel: bool, srate: int, dec: int) -> None:
-    rate = plan_rate(hz, MODELS[model], per_channel)
+    rate = dataq.plan_rate(hz, dataq.MODELS[model], per_channel)
     assert rate is not None
     assert (rate.srate, rate.dec) == (srate, dec)
     assert rate.hz == pytest.approx(60e6 / (srate * dec) / (7 if per_channel else 1))
@@ -365,13 +347,13 @@ def test_the_rate_is_laid_out_from_the_clock(model: str, hz: float, per_channel:
 
 
 def test_a_rate_that_the_model_cannot_do_has_no_setting() -> None:
-    assert plan_rate(500.0, MODELS['1110'], False) is None
-    assert plan_rate(1e6, MODELS['2108'], False) is None
+    assert dataq.plan_rate(500.0, dataq.MODELS['1110'], False) is None
+    assert dataq.plan_rate(1e6, dataq.MODELS['2108'], False) is None
 
 
 def test_the_models_are_those_of_the_data_sheets() -> None:
     """Analog inputs, a counter, a decimating filter; the highest rate is 60 MHz over the least srate."""
-    assert {name: (m.analog, m.counter, m.decimates, 60e6 / m.srate_min) for name, m in MODELS.items()} == {
+    assert {name: (m.analog, m.counter, m.decimates, 60e6 / m.srate_min) for name, m in dataq.MODELS.items()} == {
         '1100': (4, False, False, 40_000.0),
         '1110': (8, True, False, 160_000.0),
         '1120': (4, True, False, 160_000.0),
@@ -394,7 +376,7 @@ def test_the_models_are_those_of_the_data_sheets() -> None:
 )
 def test_srate_and_dec_have_the_limits_of_the_protocol(model: str, hz: float, possible: bool) -> None:
     """srate of 16 bits, dec to 512."""
-    assert (plan_rate(hz, MODELS[model], False) is not None) == possible
+    assert (dataq.plan_rate(hz, dataq.MODELS[model], False) is not None) == possible
 
 
 @pytest.mark.parametrize('per_channel', [False, True])

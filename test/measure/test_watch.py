@@ -8,18 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from psd_deflection import records
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Watch
 from psd_deflection.model.solvers.registry import solver_from_rig
-from psd_deflection.records import (
-    AppliedLoad,
-    BlockStatus,
-    DeflectionEstimate,
-    FloatArray,
-    ParameterChange,
-    SpotMeans,
-    TipLoad,
-)
 from psd_deflection.rig.config import Rig, load_rig
 
 RIG = load_rig()
@@ -43,11 +35,14 @@ class Fed:
         self._rng = np.random.default_rng(1)
 
     def load(self, fx: float, fy: float, tz: float = 0.0) -> None:
-        self.watch.put(AppliedLoad(self.block * 20_000_000, fx, fy, tz))
+        self.watch.put(records.AppliedLoad(self.block * 20_000_000, fx, fy, tz))
 
     def run(
-        self, seconds: float, of: Callable[[FloatArray], FloatArray] | FloatArray, status: BlockStatus = BlockStatus.OK
-    ) -> FloatArray:
+        self,
+        seconds: float,
+        of: Callable[[records.FloatArray], records.FloatArray] | records.FloatArray,
+        status: records.BlockStatus = records.BlockStatus.OK,
+    ) -> records.FloatArray:
         """Blocks with the readings ``of`` (4,) m, or a function of the time in this run (n,) that gives (n, 4).
 
         Their readings with the noise (n, 4), m.
@@ -61,9 +56,9 @@ class Fed:
             loads = (p / c for p, c in zip(pose, COMPLIANCE, strict=True))
             dx, dy, theta = pose
             for record in (
-                DeflectionEstimate(t_ns, self.block, 'exact', dx, dy, theta, 0.0, 0.0, (0.0,) * 9, 0.0, True),
-                TipLoad(t_ns, *loads),
-                SpotMeans(
+                records.DeflectionEstimate(t_ns, self.block, 'exact', dx, dy, theta, 0.0, 0.0, (0.0,) * 9, 0.0, True),
+                records.TipLoad(t_ns, *loads),
+                records.SpotMeans(
                     *(t_ns, self.block, tuple(four), (5.0,) * (many // 2), np.zeros((many, many)), 20, 0, status, '')
                 ),
             ):
@@ -72,12 +67,12 @@ class Fed:
         return dots
 
 
-def under(fx: float, fy: float) -> FloatArray:
+def under(fx: float, fy: float) -> records.FloatArray:
     """The readings under a load, m: PSDs move against the dots."""
     return np.asarray(REST - np.tile([fx * COMPLIANCE[0], fy * COMPLIANCE[1]], 2))
 
 
-def twisted(tz: float) -> FloatArray:
+def twisted(tz: float) -> records.FloatArray:
     """The readings under a torque, m: R(-theta) l - c of each PSD."""
     theta = tz * COMPLIANCE[2]
     c, s = np.cos(theta), np.sin(theta)
@@ -92,7 +87,7 @@ def alarmed(fed: Fed) -> bool:
 X1 = np.array([5e-6, 0.0, 0.0, 0.0])
 
 
-def wandering(t: FloatArray, rms: float = 1e-6, tau: float = 20.0) -> FloatArray:
+def wandering(t: records.FloatArray, rms: float = 1e-6, tau: float = 20.0) -> records.FloatArray:
     """Readings whose beams wander, each by itself: a Gauss-Markov process of ``rms`` m and ``tau`` s."""
     rng = np.random.default_rng(7)
     keep = np.exp(-1.0 / (SECOND * tau))
@@ -239,9 +234,9 @@ def test_what_comes_back_ends_the_alarm_and_a_zero_too() -> None:
     assert not alarmed(fed)
     fed.run(8.0, REST + X1)
     assert fed.watch.alarms == 2
-    fed.watch.changed(ParameterChange(0, 0, (('state.held_twist', (0.0, 0.0, 0.0)),)), RIG)
+    fed.watch.changed(records.ParameterChange(0, 0, (('state.held_twist', (0.0, 0.0, 0.0)),)), RIG)
     assert alarmed(fed)
-    fed.watch.changed(ParameterChange(0, 0, (('psd_1.zero', (0.0, 0.0)),)), RIG)
+    fed.watch.changed(records.ParameterChange(0, 0, (('psd_1.zero', (0.0, 0.0)),)), RIG)
     assert not alarmed(fed)
     fed.run(20.0, REST + X1)
     assert not alarmed(fed)
@@ -307,7 +302,7 @@ def test_drift_ringing_and_gaps_are_no_alarm() -> None:
     # A micrometre in a minute; then the link swings by half a millimetre, and blocks are missing.
     fed.run(60.0, lambda t: REST + np.outer(t / 60.0, np.full(4, 1e-6)))
     fed.run(10.0, lambda t: REST + 1e-6 - np.outer(5e-4 * np.exp(-1.8 * t) * np.sin(88.0 * t), [0.0, 1.0, 0.0, 1.0]))
-    fed.run(5.0, REST + 1e-3, status=BlockStatus.LASER_LOST)
+    fed.run(5.0, REST + 1e-3, status=records.BlockStatus.LASER_LOST)
     fed.run(10.0, REST + 1e-6)
     assert fed.watch.alarms == 0
     assert fed.watch.spoilt > 0
@@ -323,7 +318,7 @@ class Expected(NamedTuple):
     ended: int
 
 
-def page(values: FloatArray, least: float) -> Expected:
+def page(values: records.FloatArray, least: float) -> Expected:
     """Page's two sums of the means of 25 blocks, from the eighth window on; four tell the level before.
 
     A window that scatters more than three times as much as a quarter of all do is passed over.
@@ -397,9 +392,9 @@ def test_after_zero_or_lost_block_first_window_counts(load: tuple[float, float, 
     fed.load(0.0, 0.0)
     fed.run(0.1, under(3.0, 5.0) + X1)
     if lost:
-        fed.run(0.02, REST, BlockStatus.LASER_LOST)
+        fed.run(0.02, REST, records.BlockStatus.LASER_LOST)
     else:
-        fed.watch.changed(ParameterChange(0, 0, (('psd_1.zero', (0.0, 0.0)),)), RIG)
+        fed.watch.changed(records.ParameterChange(0, 0, (('psd_1.zero', (0.0, 0.0)),)), RIG)
     fed.run(3.6, REST)
     fed.load(*load)
     fed.run(3.0, under(0.0, 1.06 * load[1]) if load[1] else twisted(1.06 * load[2]))

@@ -16,10 +16,11 @@ from bench.simulated_arm import SimulatedArm, largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm
-from psd_deflection.arms.compensation.compensator import UNVERIFIED, Command, Compensator, Observed, State
+from psd_deflection.arms.compensation.compensator import FOREIGN_S, UNVERIFIED, Command, Compensator, Observed, State
 from psd_deflection.arms.compensation.response import JointResponse
-from psd_deflection.arms.compensation.settings import CompensatorSettings, ShaperSettings
+from psd_deflection.arms.compensation.settings import SETTINGS, SHAPING, CompensatorSettings, ShaperSettings, shaper_of
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.link.shapers import shaper
 from psd_deflection.records import FloatArray
 
 HERE = Path(__file__).parent
@@ -124,7 +125,10 @@ def test_dry_it_proposes_what_it_would_command(arm: Arm) -> None:
     dry, wet = Loop(arm, dry=True), Loop(arm)
     for loop in (dry, wet):
         loop.plant.force = PAYLOAD
+        loop.run(PERIOD)
         loop.compensator.enable(True)
+        # Estimates from before it was enabled have no residual.
+        assert math.isnan(loop.send(loop.t).residual)
         loop.run(1.6)
     assert dry.offsets == pytest.approx(wet.offsets, rel=0.05)
     assert dry.error() > 30 * wet.error()
@@ -312,6 +316,7 @@ OF_SHAPER = {'frequency': 1000.0, 'max_step': 10.0, 'lead': 1.0}
 def test_a_setting_is_within_its_bounds(name: str, most: float) -> None:
     of: Any = CompensatorSettings if name in MOST else ShaperSettings
     assert getattr(of(**{name: most}), name) == most
+    assert (SETTINGS if name in MOST else SHAPING).parameters[name].live is (name != 'frequency')
     with pytest.raises(ConfigError, match=f'{name} = .*at most'):
         of(**{name: most + 1 if name == 'good' else most * 1.001})
     if name in LARGEST or name == 'max_joint_speed':
@@ -324,6 +329,28 @@ def test_bending_is_shaped_unless_modes_are_named() -> None:
     assert ShaperSettings(frequency=0.1).frequency == 0.1
     with pytest.raises(ConfigError, match=r'frequency = 0.09 Hz: must be at least 0.1'):
         ShaperSettings(frequency=0.09)
+
+
+def test_modes_are_those_of_the_rig_file(tmp_path: Path) -> None:
+    rig = tmp_path / 'rig.yaml'
+    chosen = ShaperSettings(params_file=str(rig), shaper='zvd')
+    text = '/**:\n  ros__parameters:\n    amplifier.noise: 1e-3\n'
+    for key, value in (('bending_frequency', 13.5), ('bending_damping_ratio', 0.03)):
+        rig.write_text(text)
+        with pytest.raises(ConfigError, match=f'rig.yaml: has no dynamics.{key}; `psd-deflection identify` finds it'):
+            shaper_of(chosen)
+        text += f'    dynamics.{key}: {value}\n'
+    rig.write_text(text)
+    words = 'ZVD for 13.5 Hz, damping ratio 0.03; motions take 74 ms longer'
+    assert shaper_of(chosen) == (shaper('zvd', 13.5, 0.03), words)
+
+
+def test_controller_text_expires(arm: Arm) -> None:
+    compensator = Compensator(arm, CompensatorSettings())
+    assert compensator.controller_text(0.0) == 'nothing'
+    compensator.controller_has(0.0, np.array([0.1, -2e-6]))
+    assert compensator.controller_text(FOREIGN_S) == '0.100000, -0.000002'
+    assert compensator.controller_text(math.nextafter(FOREIGN_S, math.inf)) == 'nothing'
 
 
 def test_before_the_first_deflection_there_is_no_offset(arm: Arm) -> None:
@@ -433,13 +460,32 @@ def test_time_counts_from_when_the_last_one_was_sent(arm: Arm) -> None:
     assert np.abs(loop.compensator.watch(loop.t + 5.0).offsets - before).max() == pytest.approx(0.01 * 0.1)
 
 
-def test_slope_is_known_0_2_s_after_joint_and_offset_rest() -> None:
+@pytest.mark.parametrize(('period', 'first'), [(0.02, 70), (0.04, 65)])
+def test_slope_is_known_0_2_s_after_joint_and_offset_rest(period: float, first: int) -> None:
     response, known = JointResponse(1), []
     for n in range(100):
         moved = np.array([0.02 * min(max(n - 50, 0), 10) / 10])
-        response.add(0.02 * n, moved, moved, 0.01)
+        response.add(period * n, moved, moved, 0.01)
         known.append(bool(response.known()[0]))
-    assert known.index(True) == 70
+    assert known.index(True) == first
+
+
+def test_motion_before_first_rest_gives_no_slope() -> None:
+    response = JointResponse(1)
+    for n in range(100):
+        moved = np.array([0.02 * min(n / 10, 1.0)])
+        response.add(0.02 * n, moved, moved, 0.01)
+    assert not response.known()[0]
+
+
+@pytest.mark.parametrize(('late', 'wrong'), [(0, 1), (24, 1), (26, None)])
+def test_one_fit_is_enough_beside_a_right_joint(late: int, wrong: int | None) -> None:
+    """The second joint moves by half of its offset, ``late`` periods after the first by all of its own."""
+    response, found = JointResponse(2), []
+    for n in range(130):
+        offsets = 0.02 * np.clip(np.array([n - 50, n - 50 - late]) / 10, 0.0, 1.0)
+        found.append(response.add(0.02 * n, offsets * (1.0, 0.5), offsets, 0.01))
+    assert next((joint for joint in found if joint is not None), None) == wrong
 
 
 def test_a_fit_of_more_than_a_minute_begins_anew() -> None:
@@ -591,11 +637,14 @@ def test_switch_off_while_robot_stands_returns_offsets(arm: Arm) -> None:
 
 
 def test_controller_offsets_above_max_are_not_adopted(arm: Arm) -> None:
-    loop = Loop(arm, takeover=True)
-    loop.offsets = np.array([0.0, 3.0])
+    loop = Loop(arm, takeover=True, max_offset=0.0625)
+    loop.offsets = np.array([0.0, math.nextafter(0.0625, 1.0)])
     loop.compensator.enable(True)
-    assert loop.run(1.0).why == 'the controller applies 3 at elbow: beyond max_offset'
+    assert loop.run(1.0).why == 'the controller applies 0.0625 at elbow: beyond max_offset'
     assert not loop.sent
+    loop.offsets = adopted = np.array([0.0, 0.0625])
+    loop.run(PERIOD)
+    assert np.array_equal(loop.sent[0][1], adopted)
 
 
 def noisy(sd: float, step: float = 0.0) -> Callable[[FloatArray], FloatArray]:
@@ -710,7 +759,7 @@ def test_with_commands_the_arm_keeps_the_pose_that_it_had(arm: Arm) -> None:
     compensator.enable(True)
     command = loop.run(2.0)
     assert command.positions is not None
-    assert command.state is State.FOLLOWING
+    assert (command.state, command.limited) == (State.FOLLOWING, False)
     assert command.residual < 1e-4
     assert command.positions == pytest.approx(ELBOW + command.offsets, abs=1e-9)
     assert loop.step() <= 1.0 + 1e-9

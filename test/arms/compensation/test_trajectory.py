@@ -99,6 +99,8 @@ def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
     )
     np.testing.assert_allclose(second.at(at)[:, 0], wanted, atol=2e-3)
     assert np.array_equal(second.states[-1, 0], [0.0, 0.0])
+    # The middle of the first, at 0.25 s, was not reached.
+    assert np.abs(second.times - 0.05).min() > 5e-3
 
 
 def test_points_of_twice_replaced_trajectory_are_kept() -> None:
@@ -246,10 +248,10 @@ GOOD = [[0.0], [], []]
         (['a'], [0.0], [[[0.0, 1.0], [], []]], 'point 0 has 2 positions, must be 1'),
         (['a'], [0.0, 1.0], [[[0.0], [0.0], []], GOOD], 'point 1 has 0 velocities, must be 1'),
         (['a'], [0.0, 1.0], [GOOD, [[0.0], [], [0.0]]], 'point 1 has 1 accelerations, must be 0'),
-        (['a'], [0.0, 1.0], [GOOD, [[math.nan], [], []]], 'point 1 is not finite'),
+        (['a'], [0.0, 1.0, 2.0], [GOOD, *[[[math.nan], [], []]] * 2], 'point 1 is not finite'),
         (['a'], [0.0, 1.0], [GOOD, [[1e300], [], []]], r'point 1 is not finite, or beyond 1e\+06'),
         (['a'], [0.0, math.nan], [GOOD, GOOD], 'time_from_start = nan'),
-        (['a'], [1.0, 1.0], [GOOD, GOOD], r'point 1: time_from_start = 1 s: must be 0.001 s after'),
+        (['a'], [1.0, 1.0, 0.5], [GOOD] * 3, r'point 1: time_from_start = 1 s: must be 0.001 s after'),
         (['a'], [-1.0, 1.0], [GOOD, GOOD], r'point 0: time_from_start = -1 s'),
         (['a'], [0.0, 1e5], [GOOD, GOOD], 'it takes 100000 s, must be at most 3600 s'),
         (['a'], [0.0, 1.0], [[[0.0], [0.0], []], [[1.0], [0.2], []]], 'ends in motion: a at 0.2 rad/s'),
@@ -260,6 +262,10 @@ def test_what_cannot_be_followed_is_rejected(
 ) -> None:
     with pytest.raises(ConfigError, match=why):
         checked(names, times, points)
+
+
+def test_a_trajectory_of_an_hour_is_followed() -> None:
+    assert checked(['a'], [0.0, 3600.0], [GOOD, GOOD]).duration == 3600.0
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])

@@ -9,20 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from psd_deflection.measure.uncertainty import consistency
 from psd_deflection.measure.uncertainty.combinations import combinations_of
-from psd_deflection.measure.uncertainty.consistency import (
-    CONTRADICTS,
-    DOUBTFUL,
-    HOLD,
-    ONE_DEGREE,
-    BaseLineExcess,
-    ConsistencyCheck,
-    ConsistencyResult,
-    Unexplained,
-    UnexplainedResidual,
-    survival,
-    widened,
-)
 from psd_deflection.measure.uncertainty.outliers import OutlierSearch
 from psd_deflection.records import FloatArray
 
@@ -41,8 +29,8 @@ COVARIANCE = np.diag([4e-12, 1e-12, 9e-12, 2e-12]) + 0.5e-12
 DESIGN = np.array([[-1.0, 0.0, 0.070], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.100]])
 
 
-def two() -> ConsistencyCheck:
-    return ConsistencyCheck(2, 3, 1)
+def two() -> consistency.ConsistencyCheck:
+    return consistency.ConsistencyCheck(2, 3, 1)
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -50,7 +38,7 @@ def test_excess_of_the_base_line_is_that_of_least_squares(seed: int) -> None:
     """Whatever the weights were with which the pose was found."""
     readings = np.random.default_rng(seed).normal(size=4) * 5e-6
     residual = readings - DESIGN @ np.linalg.lstsq(DESIGN, readings, rcond=None)[0]
-    got = two().update(BaseLineExcess(REST, tuple(residual.tolist()), COVARIANCE), 1.0, None)
+    got = two().update(consistency.BaseLineExcess(REST, tuple(residual.tolist()), COVARIANCE), 1.0, None)
     assert got.chi_square == pytest.approx(residual_of(readings, DESIGN, COVARIANCE)[1], rel=1e-9)
     for i, error in enumerate(got.errors):
         true = readings - error * np.eye(4)[i]
@@ -60,10 +48,10 @@ def test_excess_of_the_base_line_is_that_of_least_squares(seed: int) -> None:
 def test_readings_across_base_line_have_no_error() -> None:
     """Along a base line in x a wrong y changes its length to second order only."""
     for y, observed in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
-        got = two().update(BaseLineExcess((0.14, y), (1e-5, 0.0, -1e-5, 0.0), COVARIANCE), 1.0, None)
+        got = two().update(consistency.BaseLineExcess((0.14, y), (1e-5, 0.0, -1e-5, 0.0), COVARIANCE), 1.0, None)
         assert [e != 0.0 for e in got.errors] == [True, observed, True, observed]
     assert two().update(None, 1.0, None) == (0.0, False, (0.0,) * 4, (0.0,) * 4, 0, 1)
-    assert BaseLineExcess(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
+    assert consistency.BaseLineExcess(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
 
 
 @pytest.mark.slow
@@ -87,7 +75,7 @@ def test_the_state_follows_its_laws_through_any_blocks() -> None:
         lasting = lasting if lasting > variance else 0.0
         doubtful = chi_square > 6.635 / 25.0 * limit
         root = 1.5 * math.sqrt(max(held, lasting, r * r if doubtful else 0.0))
-        got = of.update(BaseLineExcess(REST, tuple((along * r).tolist()), COVARIANCE), limit / 25.0, None)
+        got = of.update(consistency.BaseLineExcess(REST, tuple((along * r).tolist()), COVARIANCE), limit / 25.0, None)
         assert got.chi_square == pytest.approx(chi_square, abs=1e-9)
         assert got.contradict == (held > 0.0)
         np.testing.assert_allclose(got.errors, r / along, rtol=1e-9)
@@ -98,7 +86,9 @@ def test_the_state_follows_its_laws_through_any_blocks() -> None:
 
 
 def test_limits_of_one_degree_are_those_of_the_shares() -> None:
-    np.testing.assert_allclose(ONE_DEGREE, chi2.isf([CONTRADICTS, DOUBTFUL], 1), rtol=2e-5)
+    np.testing.assert_allclose(
+        consistency.ONE_DEGREE, chi2.isf([consistency.CONTRADICTS, consistency.DOUBTFUL], 1), rtol=2e-5
+    )
 
 
 def test_covariance_is_widened_by_each_error_alone() -> None:
@@ -106,7 +96,7 @@ def test_covariance_is_widened_by_each_error_alone() -> None:
     errors = (1e-5, -2e-5, 0.0, 3e-5)
     own = gain @ COVARIANCE @ gain.T
     want = own + sum(np.outer(gain[:, i] * e, gain[:, i] * e) for i, e in enumerate(errors))
-    np.testing.assert_allclose(widened(own, gain, errors), want, rtol=1e-12, atol=1e-24)
+    np.testing.assert_allclose(consistency.widened(own, gain, errors), want, rtol=1e-12, atol=1e-24)
 
 
 RNG = np.random.default_rng(7)
@@ -114,7 +104,7 @@ PSDS, UNKNOWNS = 4, 3
 SLOPES = RNG.normal(size=(2 * PSDS, UNKNOWNS))
 MIXED = RNG.normal(size=(2 * PSDS, 2 * PSDS))
 FULL = 1e-12 * (MIXED @ MIXED.T + np.eye(2 * PSDS))
-LIMIT = float(chi2.isf(CONTRADICTS, 2 * PSDS - UNKNOWNS))
+LIMIT = float(chi2.isf(consistency.CONTRADICTS, 2 * PSDS - UNKNOWNS))
 
 
 def unexplained(slopes: FloatArray) -> FloatArray:
@@ -131,17 +121,20 @@ def with_error(psd: int, error: tuple[float, float], chi_square: float | None = 
     return SLOPES @ [1e-5, -2e-5, 3e-5] + wrong
 
 
-def four() -> ConsistencyCheck:
-    return ConsistencyCheck(PSDS, UNKNOWNS, 2 * PSDS)
+def four() -> consistency.ConsistencyCheck:
+    return consistency.ConsistencyCheck(PSDS, UNKNOWNS, 2 * PSDS)
 
 
-def of(readings: FloatArray) -> Unexplained:
-    return UnexplainedResidual(tuple(readings.tolist()), SLOPES, FULL)
+def of(readings: FloatArray) -> consistency.Unexplained:
+    return consistency.UnexplainedResidual(tuple(readings.tolist()), SLOPES, FULL)
 
 
 def check(
-    checks: ConsistencyCheck, readings: FloatArray, blamed: Collection[int] | None = None, times: float = 1.0
-) -> ConsistencyResult:
+    checks: consistency.ConsistencyCheck,
+    readings: FloatArray,
+    blamed: Collection[int] | None = None,
+    times: float = 1.0,
+) -> consistency.ConsistencyResult:
     """``blamed``: PSDs without which the others agree; None: none may be excluded."""
     if blamed is not None:
         blamed = [psd for psd in checks.candidates(of(readings), times) if psd in blamed]
@@ -164,8 +157,8 @@ def test_psd_error_is_least_squares_with_two_unknowns(psd: int) -> None:
 def test_each_reading_has_own_error_at_low_freedom(unknowns: int) -> None:
     slopes = np.random.default_rng(unknowns).normal(size=(2 * PSDS, unknowns))
     readings = 1e-5 * np.random.default_rng(9).normal(size=2 * PSDS)
-    checks = ConsistencyCheck(PSDS, unknowns, 2 * PSDS)
-    got = checks.update(UnexplainedResidual(tuple(readings.tolist()), slopes, FULL), 1.0, None)
+    checks = consistency.ConsistencyCheck(PSDS, unknowns, 2 * PSDS)
+    got = checks.update(consistency.UnexplainedResidual(tuple(readings.tolist()), slopes, FULL), 1.0, None)
     assert got.freedom == 2 * PSDS - unknowns
     shows = unexplained(slopes).diagonal()
     for i, error in enumerate(got.errors):
@@ -177,10 +170,10 @@ def test_each_reading_has_own_error_at_low_freedom(unknowns: int) -> None:
 
 def test_without_more_readings_than_unknowns_nothing_is_checked() -> None:
     for unknowns in (2 * PSDS, 2 * PSDS + 1):
-        checks, none = ConsistencyCheck(PSDS, unknowns, 2 * PSDS), (0.0,) * (2 * PSDS)
+        checks, none = consistency.ConsistencyCheck(PSDS, unknowns, 2 * PSDS), (0.0,) * (2 * PSDS)
         assert checks.update(None, 1.0, None) == (0.0, False, none, none, 0, 0)
         assert not checks.agrees(None, 1.0)
-    assert [survival(3.0, n) for n in (0, 1, 5)] == pytest.approx([1.0, chi2.sf(3.0, 1), chi2.sf(3.0, 5)])
+    assert [consistency.survival(3.0, n) for n in (0, 1, 5)] == pytest.approx([1.0, chi2.sf(3.0, 1), chi2.sf(3.0, 5)])
 
 
 @pytest.mark.parametrize('times', [1.0, 16.0])
@@ -190,7 +183,7 @@ def test_limits(times: float) -> None:
         assert checks.candidates(of(readings), times) == ((1, 2, 3, 4) if contradict else ())
         assert checks.agrees(of(readings), times) != contradict
         assert check(checks, readings, times=times).contradict == contradict
-    doubtful = float(chi2.isf(DOUBTFUL, 5))
+    doubtful = float(chi2.isf(consistency.DOUBTFUL, 5))
     for share, widens in ((0.99, False), (1.01, True)):
         got = check(four(), with_error(2, (1.0, 0.5), share * times * doubtful), times=times)
         # Half as much again as the error of a PSD alone, and both of its readings may be wrong together.
@@ -206,7 +199,7 @@ def test_the_only_psd_to_blame_is_left_out_for_a_second(psd: int) -> None:
     blocks = 0
     while check(checks, with_error(psd, (0.0, 0.0)), {psd}).excluded:
         blocks += 1
-    assert blocks == HOLD - 1
+    assert blocks == consistency.HOLD - 1
     # Without agreement it is not left out any longer.
     check(checks, with_error(psd, (1.0, 0.5), 2.0 * LIMIT), {psd})
     assert check(checks, with_error(psd, (0.0, 0.0)), set()).excluded == 0

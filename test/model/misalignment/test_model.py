@@ -11,17 +11,7 @@ import pytest
 from blind import misaligned
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.correction import Correction
-from psd_deflection.model.misalignment.model import (
-    ALL,
-    COUNT,
-    INDEX,
-    TOLERANCES,
-    ZERO,
-    by_parameters,
-    by_pose,
-    readings,
-    response_of,
-)
+from psd_deflection.model.misalignment import model
 from psd_deflection.model.misalignment.rig import CLAMP, dots_by_parameters, known_of_rig, rig_values, vector_of_rig
 from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_to_values
 from psd_deflection.model.simulation.declaration import CALIBRATED_OF_LINK, CALIBRATED_OF_PSD, PLACED_OF_PSD
@@ -42,48 +32,48 @@ def poses() -> FloatArray:
 
 
 def vector_of(truth: dict[str, float]) -> FloatArray:
-    out = np.array([truth.get(d.name, 0.0) for d in ALL])
-    out[ZERO:] = misaligned.dots(truth, np.zeros((1, 3)))[0]
+    out = np.array([truth.get(d.name, 0.0) for d in model.ALL])
+    out[model.ZERO :] = misaligned.dots(truth, np.zeros((1, 3)))[0]
     return out
 
 
 def test_the_readings_are_those_of_rays_in_space(truth: dict[str, float], poses: FloatArray) -> None:
-    ours = readings(vector_of(truth), poses, LENGTH)
+    ours = model.readings(vector_of(truth), poses, LENGTH)
     assert ours == pytest.approx(misaligned.dots(truth, poses.T).T, abs=1e-11)
 
 
 def test_the_derivatives_are_those_of_the_readings(truth: dict[str, float], poses: FloatArray) -> None:
     p = vector_of(truth)
-    ours = by_parameters(p, poses, LENGTH)
-    for i in range(COUNT):
-        step = np.zeros(COUNT)
-        step[i] = 1e-2 * TOLERANCES[i]
-        slope = (readings(p + step, poses, LENGTH) - readings(p - step, poses, LENGTH)) / (2.0 * step[i])
-        assert ours[:, i] == pytest.approx(slope, rel=1e-4, abs=1e-10 / TOLERANCES[i]), ALL[i].name
-    flat = by_pose(p, np.zeros((3, 1)), LENGTH)[:, :, 0]
+    ours = model.by_parameters(p, poses, LENGTH)
+    for i in range(model.COUNT):
+        step = np.zeros(model.COUNT)
+        step[i] = 1e-2 * model.TOLERANCES[i]
+        slope = (model.readings(p + step, poses, LENGTH) - model.readings(p - step, poses, LENGTH)) / (2.0 * step[i])
+        assert ours[:, i] == pytest.approx(slope, rel=1e-4, abs=1e-10 / model.TOLERANCES[i]), model.ALL[i].name
+    flat = model.by_pose(p, np.zeros((3, 1)), LENGTH)[:, :, 0]
     assert flat == pytest.approx(np.array([[-1, 0, 0.07], [0, -1, 0], [-1, 0, 0], [0, -1, 0.1]]), abs=0.03)
 
 
 def test_error_of_a_parameter_moves_corrected_dots(truth: dict[str, float], poses: FloatArray) -> None:
     """What is read by the true parameters, corrected by wrong ones, of a strongly bent response."""
     p = vector_of(truth)
-    p[INDEX['psd_1.nonlinearity']] = p[INDEX['psd_2.nonlinearity']] = 8000.0
+    p[model.INDEX['psd_1.nonlinearity']] = p[model.INDEX['psd_2.nonlinearity']] = 8000.0
     ours = dots_by_parameters(p, poses, LENGTH)
-    for i in range(COUNT):
-        step = np.zeros(COUNT)
-        step[i] = 1e-2 * TOLERANCES[i]
+    for i in range(model.COUNT):
+        step = np.zeros(model.COUNT)
+        step[i] = 1e-2 * model.TOLERANCES[i]
         ends = []
-        for read in (readings(p + step, poses, LENGTH), readings(p - step, poses, LENGTH)):
-            ends.append(np.concatenate([response_of(p, n).place(read[2 * n], read[2 * n + 1]) for n in (0, 1)]))
+        for read in (model.readings(p + step, poses, LENGTH), model.readings(p - step, poses, LENGTH)):
+            ends.append(np.concatenate([model.response_of(p, n).place(read[2 * n], read[2 * n + 1]) for n in (0, 1)]))
         slope = (ends[0] - ends[1]) / (2.0 * step[i])
-        assert pytest.approx(slope, rel=1e-4, abs=1e-10 / TOLERANCES[i]) == ours[:, :, i].T, ALL[i].name
+        assert pytest.approx(slope, rel=1e-4, abs=1e-10 / model.TOLERANCES[i]) == ours[:, :, i].T, model.ALL[i].name
 
 
 def test_a_place_is_read_and_found_again(truth: dict[str, float]) -> None:
     p = vector_of(truth)
-    p[INDEX['psd_2.nonlinearity']] = -3000.0
+    p[model.INDEX['psd_2.nonlinearity']] = -3000.0
     x, y = np.random.default_rng(3).uniform(-5e-3, 5e-3, (2, 100))
-    response = response_of(p, 1)
+    response = model.response_of(p, 1)
     assert np.array(response.place(*response.reading(x, y))) == pytest.approx(np.array([x, y]), abs=1e-15)
 
 
@@ -148,9 +138,9 @@ def test_stated_deviations_and_correlations_are_taken() -> None:
         }
     )
     known = known_of_rig(rig)
-    at = [INDEX['psd_1.height'], INDEX['psd_2.height']]
+    at = [model.INDEX['psd_1.height'], model.INDEX['psd_2.height']]
     assert known.covariance[np.ix_(at, at)] == pytest.approx(np.array([[1e-6, -1e-6], [-1e-6, 4e-6]]))
-    assert known.covariance[0, 0] == pytest.approx(TOLERANCES[0] ** 2)
+    assert known.covariance[0, 0] == pytest.approx(model.TOLERANCES[0] ** 2)
 
 
 RIG = load_rig()
@@ -180,19 +170,19 @@ def test_user_effect_is_calibrated_as_declared(tmp_path: Path, monkeypatch: pyte
     rig = load_rig(overrides=listed)
     vector = vector_of_rig(rig)
     assert vector.others == []
-    at = INDEX['psd_2.gain_x']
+    at = model.INDEX['psd_2.gain_x']
     assert vector.values[at] == 0.01
     # What a calibration finds goes into the effect that the file has; of others into the package's own.
     found = vector.values.copy()
     found[at] = 0.012
-    found[INDEX['psd_1.rotation']] = TOLERANCES[INDEX['psd_1.rotation']]
+    found[model.INDEX['psd_1.rotation']] = model.TOLERANCES[model.INDEX['psd_1.rotation']]
     _, effects = rig_values(vector, found, vector.clamp)
     own = [a for a in effects if 'psd' in a.values]
     assert [(a.effect.name, a.values['psd']) for a in own] == [('sensor_rotation', 1.0), ('my_gain', 2.0)]
     assert own[1].values['x'] == 0.012
     dots = np.array([[0.0, 0.0, 1.01e-3, 0.0]])
     assert Correction.from_rig(rig).apply(dots)[0, 2] == pytest.approx(1e-3)
-    found[INDEX['psd_2.gain_y']] = 0.004
+    found[model.INDEX['psd_2.gain_y']] = 0.004
     for known, want in ((vector, ['my_gain', 'sensor_gain']), (vector_of_rig(RIG), ['sensor_gain'])):
         _, effects = rig_values(known, found, vector.clamp)
         gains = [a for a in effects if a.effect.name.endswith('gain')]
@@ -222,7 +212,7 @@ def test_a_declaration_that_a_calibration_cannot_use_is_rejected(name: str, call
 
 
 def test_what_a_declaration_may_name_is_what_a_calibration_finds() -> None:
-    of_psd = {name.removeprefix('psd_1.') for name in INDEX if name.startswith('psd_1.') and '.zero' not in name}
+    of_psd = {name.removeprefix('psd_1.') for name in model.INDEX if name.startswith('psd_1.') and '.zero' not in name}
     assert {*CALIBRATED_OF_PSD, *PLACED_OF_PSD} == of_psd | {'aimed'}
     assert set(CALIBRATED_OF_LINK) == {*CLAMP, 'link.slope_ratio'}
 
@@ -234,7 +224,7 @@ def test_wrong_user_effect_is_rejected_if_listed(tmp_path: Path, monkeypatch: py
         vector_of_rig(load_rig(overrides={'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}))
     vector = vector_of_rig(RIG)
     found = vector.values.copy()
-    found[INDEX['psd_2.gain_x']] = 0.012
+    found[model.INDEX['psd_2.gain_x']] = 0.012
     _, effects = rig_values(vector, found, vector.clamp)
     assert [a.effect.name for a in effects if 'psd' in a.values] == ['sensor_gain']
 
@@ -248,7 +238,7 @@ def test_two_effects_that_give_one_parameter_are_rejected(tmp_path: Path, monkey
         vector_of_rig(load_rig(overrides={**own, **ours, 'effects.b.x': 0.01}))
     # They share no parameter: this one's x is off, or it is of the other PSD.
     for apart in ({'effects.b.y': 0.01}, {'effects.b.x': 0.01, 'effects.b.psd': 1}):
-        assert vector_of_rig(load_rig(overrides={**own, **ours, **apart})).values[INDEX['psd_2.gain_x']] == 0.01
+        assert vector_of_rig(load_rig(overrides={**own, **ours, **apart})).values[model.INDEX['psd_2.gain_x']] == 0.01
 
 
 def test_an_effect_listed_twice_is_rejected() -> None:
@@ -262,11 +252,11 @@ def test_an_effect_listed_twice_is_rejected() -> None:
 def test_undetermined_slope_ratio_is_written_valid(found: float) -> None:
     vector = vector_of_rig(RIG)
     p = vector.values.copy()
-    p[INDEX['link.slope_ratio']] = found
+    p[model.INDEX['link.slope_ratio']] = found
     values, effects = rig_values(vector, p, vector.clamp)
     assert values['link.slope_ratio'] == max(found, 0.0)
     tilts = [a.values['slope_ratio'] for a in effects if 'slope_ratio' in a.values]
     assert tilts == ([found] if found > 0.0 else [])
     replace_values(RIG, values)
     # The caller's own numbers stay.
-    assert p[INDEX['link.slope_ratio']] == found
+    assert p[model.INDEX['link.slope_ratio']] == found

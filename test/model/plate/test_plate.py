@@ -9,23 +9,10 @@ import pytest
 
 from psd_deflection.base.errors import SolverError
 from psd_deflection.model.plate import Geometry
+from psd_deflection.model.plate import plate as module
 from psd_deflection.model.plate.landing import landing, landings
 from psd_deflection.model.plate.layout import bend, check_shapes, check_twist, tip_boxes
 from psd_deflection.model.plate.linear import condition_number, design_matrix, error_bound, gain_matrix
-from psd_deflection.model.plate.plate import (
-    Tilts,
-    crossing,
-    crossings,
-    flat_points,
-    flat_pose,
-    flat_poses,
-    plate_points,
-    points_under,
-    points_under_leaning,
-    reading_slopes,
-    tie_matrix,
-    tied_pose,
-)
 from psd_deflection.model.plate.rays import hit, lifted, rotation
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.thesis.appendix_d import printed_design_matrix
@@ -44,19 +31,20 @@ STAGGERED = Geometry(
 def test_golden_readings(golden: Any, case: str) -> None:
     dx, dy, _, theta, phi, omega = golden.cases[case]['pose']
     geometry = golden.geometry(case)
-    points = plate_points(np.array([dx, dy, theta, phi, omega]), geometry.beams, geometry.heights)
+    points = module.plate_points(np.array([dx, dy, theta, phi, omega]), geometry.beams, geometry.heights)
     assert (points - geometry.centers).ravel() == pytest.approx(np.array(golden.dots(case)), abs=1e-15)
 
 
 def test_the_dots_are_where_the_rays_meet_the_plate(rays: Any) -> None:
     expected = np.array([rays.tip_dots(STAGGERED, pose) for pose in POSES]).reshape(6, 3, 2) + STAGGERED.centers
     beams, heights = STAGGERED.beams, STAGGERED.heights
-    points, jacobian = crossings(POSES, beams, heights)
+    points, jacobian = module.crossings(POSES, beams, heights)
     assert points == pytest.approx(expected, abs=1e-15)
-    np.testing.assert_array_equal(plate_points(POSES, beams, heights), points)
+    np.testing.assert_array_equal(module.plate_points(POSES, beams, heights), points)
     np.testing.assert_array_equal(
         np.stack(
-            points_under((beams[:, 0], beams[:, 1], heights), tuple(np.moveaxis(POSES[..., None], 1, 0))), axis=-1
+            module.points_under((beams[:, 0], beams[:, 1], heights), tuple(np.moveaxis(POSES[..., None], 1, 0))),
+            axis=-1,
         ),
         points,
     )
@@ -64,24 +52,24 @@ def test_the_dots_are_where_the_rays_meet_the_plate(rays: Any) -> None:
         dx, dy, theta, phi, omega = POSES[i].tolist()
         for j in range(3):
             lx, ly = beams[j].tolist()
-            qx, qy, row_x, row_y = crossing((lx, ly, float(heights[j])), (dx, dy, theta, phi, omega))
+            qx, qy, row_x, row_y = module.crossing((lx, ly, float(heights[j])), (dx, dy, theta, phi, omega))
             assert (qx, qy) == pytest.approx(points[i, j], abs=1e-16)
             assert np.array([row_x, row_y]) == pytest.approx(jacobian[i, j], abs=1e-14)
     many = np.broadcast_to(beams, (6, 3, 2))
-    np.testing.assert_array_equal(crossings(POSES, many, heights)[1], jacobian)
+    np.testing.assert_array_equal(module.crossings(POSES, many, heights)[1], jacobian)
 
 
 def test_derivatives_agree_with_differences() -> None:
     step = 1e-6
     beams, heights = STAGGERED.beams, STAGGERED.heights
     moved = [
-        (plate_points(POSES + d, beams, heights) - plate_points(POSES - d, beams, heights)) / (2.0 * step)
+        (module.plate_points(POSES + d, beams, heights) - module.plate_points(POSES - d, beams, heights)) / (2.0 * step)
         for d in step * np.eye(5)
     ]
-    jacobian = crossings(POSES, beams, heights)[1]
+    jacobian = module.crossings(POSES, beams, heights)[1]
     assert jacobian == pytest.approx(np.stack(moved, axis=-1), abs=1e-9)
     pushed = [
-        (plate_points(POSES, beams + d, heights) - plate_points(POSES, beams - d, heights)) / (2.0 * step)
+        (module.plate_points(POSES, beams + d, heights) - module.plate_points(POSES, beams - d, heights)) / (2.0 * step)
         for d in step * np.eye(2)
     ]
     assert -jacobian[..., :2] == pytest.approx(np.stack(pushed, axis=-1), abs=1e-9)
@@ -93,11 +81,11 @@ def test_a_flat_pose_comes_back(rays: Any) -> None:
     # Unless it is given that of a beam with a force at its end: L^2/2 over L^3/3.
     assert level.slope_ratio == (1 / 2) / (1 / 3)
     points = np.array([rays.tip_dots(level, pose) for pose in flat]).reshape(6, 3, 2) + level.centers
-    assert flat_points(flat[:, :3], level.beams) == pytest.approx(points, abs=1e-15)
-    assert flat_poses(points, level.beams) == pytest.approx(flat[:, :3], abs=1e-14)
+    assert module.flat_points(flat[:, :3], level.beams) == pytest.approx(points, abs=1e-15)
+    assert module.flat_poses(points, level.beams) == pytest.approx(flat[:, :3], abs=1e-14)
     places = [(x, y) for x, y in level.beams.tolist()]
     for i in range(6):
-        assert flat_pose(points[i].ravel().tolist(), places) == pytest.approx(flat[i, :3], abs=1e-14)
+        assert module.flat_pose(points[i].ravel().tolist(), places) == pytest.approx(flat[i, :3], abs=1e-14)
 
 
 def test_beams_and_surfaces_of_any_direction(rays: Any) -> None:
@@ -116,8 +104,8 @@ def test_beams_and_surfaces_of_any_direction(rays: Any) -> None:
 
 def test_the_tie_is_the_cantilevers() -> None:
     pose = np.array([0.00012, -0.00225, 0.01])
-    tied = tied_pose(pose, 1.5, 0.585)
-    assert tied == pytest.approx(tie_matrix(1.5, 0.585) @ pose, rel=1e-15)
+    tied = module.tied_pose(pose, 1.5, 0.585)
+    assert tied == pytest.approx(module.tie_matrix(1.5, 0.585) @ pose, rel=1e-15)
     # Golden case G5: phi 0.33055 deg, omega 0.017629 deg.
     assert np.degrees(tied[3:]) == pytest.approx([0.3305525741, 0.01762947062], rel=1e-9)
 
@@ -125,8 +113,8 @@ def test_the_tie_is_the_cantilevers() -> None:
 def test_many_poses_are_tied_one_by_one() -> None:
     flat = POSES[:, :3]
     for ratios in (1.5, np.linspace(1.0, 2.0, 6)):
-        want = [tied_pose(p, k, 0.585) for p, k in zip(flat, np.broadcast_to(ratios, 6), strict=True)]
-        np.testing.assert_array_equal(tied_pose(flat, ratios, 0.585), want)
+        want = [module.tied_pose(p, k, 0.585) for p, k in zip(flat, np.broadcast_to(ratios, 6), strict=True)]
+        np.testing.assert_array_equal(module.tied_pose(flat, ratios, 0.585), want)
 
 
 def test_the_geometry_is_that_of_the_rig_file() -> None:
@@ -139,7 +127,7 @@ def test_the_geometry_is_that_of_the_rig_file() -> None:
 
 
 @pytest.mark.parametrize('tilts', ['none', 'tied', 'bounded', 'free'])
-def test_readings_go_with_what_is_solved_for_as_differences_say(tilts: Tilts) -> None:
+def test_readings_go_with_what_is_solved_for_as_differences_say(tilts: module.Tilts) -> None:
     """Of a flat plate whatever its heights and tilts; tied to the deflection; with tilts of their own."""
     pose, beams, k = np.array([2e-3, -3e-3, 0.04, 0.02, -0.03]), STAGGERED.beams, 1.4 / 0.585
     heights = np.zeros(3) if tilts == 'none' else STAGGERED.heights
@@ -151,11 +139,11 @@ def test_readings_go_with_what_is_solved_for_as_differences_say(tilts: Tilts) ->
             tie = 0.0 if tilts == 'none' else k
             moved = np.array([*change, -tie * change[1], tie * change[0]])
         at = np.array([*pose[:3], 0.0, 0.0]) if tilts == 'none' else pose
-        return plate_points(at + moved, beams, heights).ravel()
+        return module.plate_points(at + moved, beams, heights).ravel()
 
     steps = 1e-6 * np.eye(5 if tilts == 'free' else 3)
     want = np.stack([(readings(e) - readings(-e)) / 2e-6 for e in steps], axis=1)
-    got = reading_slopes(beams, STAGGERED.heights, pose, tilts, 1.4, 0.585)
+    got = module.reading_slopes(beams, STAGGERED.heights, pose, tilts, 1.4, 0.585)
     np.testing.assert_allclose(got, want, atol=1e-8)
 
 
@@ -188,7 +176,7 @@ def test_a_beam_that_leans_meets_the_plate_where_its_ray_does(height: float) -> 
     origin = plate @ [0.0, 0.0, height] + [pose[0], pose[1], 0.0]
     want = hit(np.array([*PLACE, height]), np.array([*slopes, 1.0]), origin, plate)
     lx, ly, sx, sy, h, dx, dy, theta, phi, omega = (np.asarray(v) for v in (*PLACE, *slopes, height, *pose))
-    got = points_under_leaning((lx, ly, h), (sx, sy), (dx, dy, theta, phi, omega))
+    got = module.points_under_leaning((lx, ly, h), (sx, sy), (dx, dy, theta, phi, omega))
     # Three passes, each of which leaves 6e-4 of the error before it, of 10 um at first.
     assert np.array(got) == pytest.approx(want, abs=3e-14)
 

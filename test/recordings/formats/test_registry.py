@@ -11,14 +11,7 @@ import pytest
 import psd_deflection as pd
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.recordings.formats.format import (
-    FORMATS,
-    GROUP,
-    endings_of_recordings,
-    find_format,
-    format_of_name,
-    formats,
-)
+from psd_deflection.recordings.formats import format
 from psd_deflection.recordings.read.references import read_references
 from psd_deflection.recordings.write.sinks import open_reference_file, open_sink
 from psd_deflection.records import ReferenceWithCovariance, SampleBlock
@@ -31,17 +24,17 @@ PAGE = Path(__file__).parents[3] / 'docs' / 'recording.md'
 
 
 def test_names_and_endings_are_different() -> None:
-    assert [find_format(name).name for name in FORMATS] == list(FORMATS)
-    endings = [ending for f in formats() for ending in f.suffixes]
+    assert [format.find_format(name).name for name in format.FORMATS] == list(format.FORMATS)
+    endings = [ending for f in format.formats() for ending in f.suffixes]
     assert len(set(endings)) == len(endings)
     assert all(ending == ending.lower() and ending.startswith('.') for ending in endings)
 
 
-@pytest.mark.parametrize('name', FORMATS)
+@pytest.mark.parametrize('name', format.FORMATS)
 def test_what_is_written_is_read_or_is_only_to_be_looked_at(tmp_path: Path, name: str) -> None:
-    form = find_format(name)
+    form = format.find_format(name)
     path = tmp_path / f'a{form.suffixes[0] if form.suffixes else ""}'
-    assert format_of_name(path) is form
+    assert format.format_of_name(path) is form
     if form.name == 'rerun':
         pytest.importorskip('rerun')
     assert form.write is not None
@@ -56,9 +49,9 @@ def test_what_is_written_is_read_or_is_only_to_be_looked_at(tmp_path: Path, name
         assert len(pd.open(path).samples) == SAMPLES
 
 
-@pytest.mark.parametrize('name', [n for n in FORMATS if find_format(n).write_references])
+@pytest.mark.parametrize('name', [n for n in format.FORMATS if format.find_format(n).write_references])
 def test_poses_of_a_camera_are_references_when_they_are_read(tmp_path: Path, name: str) -> None:
-    form = find_format(name)
+    form = format.find_format(name)
     path = tmp_path / f'a{form.suffixes[0] if form.suffixes else ""}'
     file = open_reference_file(path)
     pose = ReferenceWithCovariance(10**9, 1e-6, 2e-6, 3e-6, 0.0, 0.0, tuple(np.eye(3).ravel()))
@@ -79,7 +72,7 @@ def test_a_file_of_another_name_is_known_by_its_content(tmp_path: Path) -> None:
     assert len(pd.open(other).samples) == SAMPLES
 
 
-@pytest.mark.skipif('rerun' not in FORMATS, reason='an optional room')
+@pytest.mark.skipif('rerun' not in format.FORMATS, reason='an optional room')
 def test_a_format_without_references_takes_none(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='does not take the poses of a camera'):
         open_reference_file(tmp_path / 'a.rrd')
@@ -104,7 +97,7 @@ def test_a_format_made_as_the_page_says_is_read_like_ours(
     np.savez(path, t=t, volts=np.ones((100, 6)))
     recording = pd.open(path)
     assert recording.samples['t_ns'].tolist() == (np.arange(100) * 10**6).tolist()
-    assert '.npz' in endings_of_recordings()
+    assert '.npz' in format.endings_of_recordings()
     assert main(['convert', str(path), '--out', str(tmp_path / 'run.csv')]) == 0
     assert capsys.readouterr().out == f'{tmp_path / "run.csv"}: 100 samples\n'
     # It is read and not written, and .npz is no bag's ending.
@@ -120,7 +113,7 @@ def test_a_format_made_as_the_page_says_is_read_like_ours(
 def test_a_format_that_is_none_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, message: str
 ) -> None:
-    install_plug_in(tmp_path, monkeypatch, 'logger', code, f'[{GROUP}]\nmine = my_package.logger:FORMAT\n')
+    install_plug_in(tmp_path, monkeypatch, 'logger', code, f'[{format.GROUP}]\nmine = my_package.logger:FORMAT\n')
     (tmp_path / 'run.npz').touch()
     with pytest.raises(ConfigError, match=f"format 'mine': my_package.logger:FORMAT.* ?{message}"):
         pd.open(tmp_path / 'run.npz')

@@ -12,17 +12,7 @@ import pytest
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, DaemonError, RecordingError, UsageError
-from psd_deflection.run.fleet.tasks import (
-    AHEAD,
-    LARGEST_LIST,
-    Outcome,
-    attempt,
-    check_engine,
-    is_plain,
-    listed,
-    open_engine,
-    outcomes,
-)
+from psd_deflection.run.fleet import tasks
 from test.run.fleet.mortal import dies, length
 
 T = TypeVar('T')
@@ -66,7 +56,7 @@ class Later:
 
 def test_outcomes_come_in_order_whatever_ends_first() -> None:
     ended: list[int] = []
-    found = list(outcomes(length, NAMES, Later(3), lambda: ended.append(1)))
+    found = list(tasks.outcomes(length, NAMES, Later(3), lambda: ended.append(1)))
     assert [o.name for o in found] == NAMES
     assert [o.value for o in found] == [1, 3, None, 2, None, 4]
     assert len(ended) == len(NAMES)
@@ -86,7 +76,7 @@ def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
         return future
 
     engine.submit = alone  # type: ignore[method-assign]
-    found = list(outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
+    found = list(tasks.outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
     assert [o.value for o in found] == [1, 3, None, 4, 1]
     assert found[2].error == 'cc: its worker was killed, twice; too little memory?'
     assert engine.renewed == 3
@@ -95,14 +85,14 @@ def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
 def test_a_worker_that_is_lost_once_more_costs_nothing() -> None:
     # `cc` waited for a worker when the pool was lost, and is killed once itself.
     engine = Later(1, 'cc', 'cc')
-    found = list(outcomes(length, ['a', 'cc', 'dddd'], engine))
+    found = list(tasks.outcomes(length, ['a', 'cc', 'dddd'], engine))
     assert [o.value for o in found] == [1, 2, 4]
     assert engine.renewed == 2
 
 
 def test_results_that_wait_for_an_earlier_one_are_bounded() -> None:
     given: list[str] = []
-    first: Future[Outcome[int]] = Future()
+    first: Future[tasks.Outcome[int]] = Future()
 
     class Slow:
         slots = 4
@@ -112,23 +102,23 @@ def test_results_that_wait_for_an_earlier_one_are_bounded() -> None:
             future: Future[Any] = first if len(given) == 1 else Future()
             if future is not first:
                 future.set_result(task(*arguments))
-            if len(given) == 4 + AHEAD:
-                first.set_result(Outcome('0', 1))
+            if len(given) == 4 + tasks.AHEAD:
+                first.set_result(tasks.Outcome('0', 1))
             return future
 
         def renew(self) -> None:
             raise AssertionError
 
     names = [str(i) for i in range(200)]
-    work = outcomes(length, names, Slow())
+    work = tasks.outcomes(length, names, Slow())
     assert next(work).name == '0'
-    assert len(given) == 4 + AHEAD
+    assert len(given) == 4 + tasks.AHEAD
     assert [o.name for o in work] == names[1:]
 
 
 def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert attempt(length, 'abc', __version__).value == 3
-    answer = attempt(length, 'abc', '99.0')
+    assert tasks.attempt(length, 'abc', __version__).value == 3
+    answer = tasks.attempt(length, 'abc', '99.0')
     assert answer.value is None
     assert answer.error.startswith(f'a worker has psd_deflection {__version__}, here is 99.0')
 
@@ -136,8 +126,8 @@ def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.slow
 def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
     names = [str(tmp_path / name) for name in ('a', 'poison', 'bb', 'once', 'ccc')]
-    with open_engine('processes:2') as pool:
-        found = list(outcomes(dies, names, pool))
+    with tasks.open_engine('processes:2') as pool:
+        found = list(tasks.outcomes(dies, names, pool))
     assert [o.value for o in found] == [1, None, 2, 4, 3]
     assert found[1].error.endswith('poison: its worker was killed, twice; too little memory?')
 
@@ -147,8 +137,8 @@ def test_a_run_that_is_given_up_leaves_no_process() -> None:
     before = multiprocessing.active_children()
 
     def interrupted() -> None:
-        with open_engine('processes:2') as pool:
-            next(outcomes(length, NAMES, pool))
+        with tasks.open_engine('processes:2') as pool:
+            next(tasks.outcomes(length, NAMES, pool))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -161,14 +151,14 @@ def test_a_run_that_is_given_up_leaves_no_process() -> None:
 )
 def test_another_word_is_rejected(word: str) -> None:
     with pytest.raises(UsageError, match='must be serial, processes'):
-        check_engine(word)
+        tasks.check_engine(word)
 
 
 def test_encryption_without_certificates_is_rejected() -> None:
     pytest.importorskip('distributed')
     with (
         pytest.raises(ConfigError, match=r"^--executor dask\+tls://127\.0\.0\.1:1: Dask's configuration has no cert"),
-        open_engine('dask+tls://127.0.0.1:1'),
+        tasks.open_engine('dask+tls://127.0.0.1:1'),
     ):
         pass
 
@@ -178,7 +168,7 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch)
     # Nothing listens on the port of tcpmux.
     with (
         pytest.raises(DaemonError, match=r'^dask://127\.0\.0\.1:1: no Dask scheduler answers'),
-        open_engine('dask://127.0.0.1:1'),
+        tasks.open_engine('dask://127.0.0.1:1'),
     ):
         pass
 
@@ -196,28 +186,28 @@ def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_words_stay_in_their_order_each_once(archive: Path) -> None:
-    assert listed(['b/lone.mcap', 'nowhere', 'a/run_1', 'b/lone.mcap']) == ['b/lone.mcap', 'nowhere', 'a/run_1']
+    assert tasks.listed(['b/lone.mcap', 'nowhere', 'a/run_1', 'b/lone.mcap']) == ['b/lone.mcap', 'nowhere', 'a/run_1']
 
 
 def test_pattern_takes_bags_and_files_not_bag_parts(archive: Path) -> None:
-    assert listed(['**']) == ['a/run_1', 'a/run_2', 'b/lone.mcap', 'b/run[1].csv', 'b/table.CSV']
-    assert listed(['a/*']) == ['a/run_1', 'a/run_2']
+    assert tasks.listed(['**']) == ['a/run_1', 'a/run_2', 'b/lone.mcap', 'b/run[1].csv', 'b/table.CSV']
+    assert tasks.listed(['a/*']) == ['a/run_1', 'a/run_2']
     # Asked for by name, a file of a bag is a recording.
-    assert listed(['**/*.mcap']) == ['a/run_1/run_1_0.mcap', 'a/run_2/run_2_0.mcap', 'b/lone.mcap']
-    assert listed([f'{archive}/b/*.mcap']) == [f'{archive}/b/lone.mcap']
+    assert tasks.listed(['**/*.mcap']) == ['a/run_1/run_1_0.mcap', 'a/run_2/run_2_0.mcap', 'b/lone.mcap']
+    assert tasks.listed([f'{archive}/b/*.mcap']) == [f'{archive}/b/lone.mcap']
 
 
 def test_a_name_that_looks_like_a_pattern_and_exists_is_a_name(archive: Path) -> None:
-    assert is_plain('b/run[1].csv')
-    assert listed(['b/run[1].csv']) == ['b/run[1].csv']
-    assert not is_plain('b/run[12].csv')
+    assert tasks.is_plain('b/run[1].csv')
+    assert tasks.listed(['b/run[1].csv']) == ['b/run[1].csv']
+    assert not tasks.is_plain('b/run[12].csv')
 
 
 def test_a_list_is_relative_to_its_folder(archive: Path) -> None:
     (archive / 'b' / 'list.txt').write_text('\ufeff# the good ones\n\nlone.mcap\n  ../a/*  \n', encoding='utf-8')
-    assert not is_plain('b/list.txt')
-    assert listed(['b/list.txt', 'a/run_1']) == ['b/lone.mcap', 'b/../a/run_1', 'b/../a/run_2', 'a/run_1']
-    assert listed(['none.txt']) == ['none.txt']
+    assert not tasks.is_plain('b/list.txt')
+    assert tasks.listed(['b/list.txt', 'a/run_1']) == ['b/lone.mcap', 'b/../a/run_1', 'b/../a/run_2', 'a/run_1']
+    assert tasks.listed(['none.txt']) == ['none.txt']
 
 
 @pytest.mark.parametrize(
@@ -226,12 +216,12 @@ def test_a_list_is_relative_to_its_folder(archive: Path) -> None:
         (b'# nothing\n', 'lists no recording'),
         (b'\xff\xfe\n', 'is not UTF-8'),
         (b'*.mcap\n', 'matches no recording'),
-        (b'\n' * (LARGEST_LIST + 1), 'larger than 16 MiB'),
+        (b'\n' * (tasks.LARGEST_LIST + 1), 'larger than 16 MiB'),
     ],
 )
 def test_a_bad_list_is_rejected(archive: Path, content: bytes, message: str) -> None:
     (archive / 'list.txt').write_bytes(content)
     with pytest.raises(RecordingError, match=message):
-        listed(['list.txt'])
+        tasks.listed(['list.txt'])
     with pytest.raises(RecordingError, match=r'^c\*: matches no recording'):
-        listed(['c*'])
+        tasks.listed(['c*'])

@@ -13,21 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psd_deflection import records
 from psd_deflection.base.log import INFO
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
-from psd_deflection.records import (
-    RESTART,
-    AppliedLoad,
-    BlockStatus,
-    ParameterChange,
-    Record,
-    ReferencePose,
-    SampleBlock,
-    SpotMeans,
-    TipLoad,
-)
 from psd_deflection.run.monitor.feed import COLUMNS, BlockResult, Feed, row_columns, row_json
 from psd_deflection.run.monitor.shown import RejectedError
 from psd_deflection.run.monitor.shown_recording import ShownRecording
@@ -40,7 +30,7 @@ BAGS = Path(__file__).parents[3] / 'bags'
 def source_of(name: str, feed: Feed, message: list[str], ended: threading.Event, speed: float = 1e6) -> ShownRecording:
     rig = rig_at_start(open_recording(BAGS / name))
 
-    def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
+    def open_steps() -> tuple[Pipeline, Iterator[list[records.Record]]]:
         recording = open_recording(BAGS / name)
         pipeline = Pipeline(rig)
         return pipeline, replayed(recording, pipeline)
@@ -50,7 +40,7 @@ def source_of(name: str, feed: Feed, message: list[str], ended: threading.Event,
         ended.set()
 
     first = next(iter(open_recording(BAGS / name).blocks()))
-    inputs = [AppliedLoad(int(first.t_ns[0]) + k * 10**9, 0.0, -k, 0.0) for k in (3, 1, 0, 2)]
+    inputs = [records.AppliedLoad(int(first.t_ns[0]) + k * 10**9, 0.0, -k, 0.0) for k in (3, 1, 0, 2)]
     return ShownRecording(name, open_steps, feed, log, speed=speed, inputs=inputs)
 
 
@@ -94,9 +84,9 @@ class Heard(Feed):
         super().__init__()
         self.estimated = threading.Event()
 
-    def put(self, record: Record) -> None:
+    def put(self, record: records.Record) -> None:
         super().put(record)
-        if isinstance(record, SpotMeans) and record.status is BlockStatus.OK:
+        if isinstance(record, records.SpotMeans) and record.status is records.BlockStatus.OK:
             self.estimated.set()
 
 
@@ -119,16 +109,16 @@ class Played(Feed):
         super().__init__()
         self.times: list[int] = []
         self.gone = 0
-        self.others: list[Record] = []
+        self.others: list[records.Record] = []
         self._new = threading.Condition()
 
-    def put(self, record: Record) -> None:
+    def put(self, record: records.Record) -> None:
         super().put(record)
         self.gone += sum(item.gone for item in self.take() if isinstance(item, BlockResult))
         with self._new:
-            if isinstance(record, SpotMeans):
+            if isinstance(record, records.SpotMeans):
                 self.times.append(record.t_ns)
-            elif isinstance(record, AppliedLoad | ReferencePose | ParameterChange):
+            elif isinstance(record, records.AppliedLoad | records.ReferencePose | records.ParameterChange):
                 self.others.append(record)
             self._new.notify_all()
 
@@ -186,7 +176,7 @@ def test_a_recording_can_be_paused_and_sought() -> None:
 def test_a_row_has_the_block_and_its_primary_estimate() -> None:
     feed = Feed()
     feed.put(estimate_of(7))
-    feed.put(TipLoad(0, 0.0, 0.0, 0.0))
+    feed.put(records.TipLoad(0, 0.0, 0.0, 0.0))
     feed.put(estimate_of(7, primary=False)._replace(dx=9.0))
     feed.put(spots_of(7, lost=3))
     (result,) = feed.take()
@@ -203,7 +193,7 @@ def test_blocks_of_which_nothing_came_are_counted_with_the_next() -> None:
     feed = Feed(limit=6)
     for index in (5, 6, 9, 2, 3):
         feed.put(spots_of(index))
-    feed.put(ParameterChange(START_NS, 4, ((RESTART, (70.0, 2000.0)),)))
+    feed.put(records.ParameterChange(START_NS, 4, ((records.RESTART, (70.0, 2000.0)),)))
     feed.put(spots_of(100))
     feed.put(spots_of(101))
     assert [r.gone for r in feed.take() if isinstance(r, BlockResult)] == [0, 0, 2, 0, 0, 0]
@@ -216,13 +206,13 @@ def test_blocks_of_which_nothing_came_are_counted_with_the_next() -> None:
 def test_a_block_without_an_estimate_does_not_borrow_one() -> None:
     feed = Feed()
     feed.put(estimate_of(3))
-    feed.put(spots_of(4, status=BlockStatus.LASER_LOST))
-    feed.put(spots_of(5, status=BlockStatus.LASER_LOST))
+    feed.put(spots_of(4, status=records.BlockStatus.LASER_LOST))
+    feed.put(spots_of(5, status=records.BlockStatus.LASER_LOST))
     for result in feed.take():
         assert isinstance(result, BlockResult)
         row = dict(zip(COLUMNS, json.loads(row_json(result)), strict=True))
         assert [row[k] for k in ('dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta')] == [None] * 6
-        assert row['status'] == BlockStatus.LASER_LOST
+        assert row['status'] == records.BlockStatus.LASER_LOST
 
 
 def test_nan_becomes_null() -> None:
@@ -233,7 +223,7 @@ def test_nan_becomes_null() -> None:
 
 def test_items_beyond_the_queue_are_dropped_and_counted() -> None:
     feed = Feed(limit=10)
-    block = SampleBlock(
+    block = records.SampleBlock(
         0, np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros((1, 6), np.float32), np.zeros(1, np.uint8)
     )
     for index in range(25):

@@ -8,16 +8,9 @@ import pytest
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.budget import sensor
 from psd_deflection.studies.budget.budget import BudgetProblem, budget, default_load
 from psd_deflection.studies.budget.installation import averaging_gain
-from psd_deflection.studies.budget.sensor import (
-    air_index,
-    boundary_shift,
-    gradient_shift,
-    index_per_kelvin,
-    refracted_angle,
-    saturation_pressure,
-)
 
 
 def air_index_short(temperature: float, humidity: float, co2: float) -> float:
@@ -34,7 +27,7 @@ def air_index_short(temperature: float, humidity: float, co2: float) -> float:
     ],
 )
 def test_the_index_of_air(temperature: float, co2: float, humidity: float, expected: float) -> None:
-    got = air_index(101_325.0, temperature, humidity, co2, 633e-9)
+    got = sensor.air_index(101_325.0, temperature, humidity, co2, 633e-9)
     assert got == pytest.approx(expected, abs=1e-12)
     # The short form stays within 2e-7 of it.
     assert air_index_short(temperature, humidity, co2) == pytest.approx(got, abs=2e-7)
@@ -42,7 +35,7 @@ def test_the_index_of_air(temperature: float, co2: float, humidity: float, expec
 
 def test_standard_air_agrees_with_another_authors_formula() -> None:
     # Ciddor (Applied Optics 35, 1996) for dry air at 15 degrees, 450 ppm CO2: 1.00027653 at 633 nm.
-    assert air_index(101_325.0, 288.15, 0.0) == pytest.approx(1.00027653, abs=5e-9)
+    assert sensor.air_index(101_325.0, 288.15, 0.0) == pytest.approx(1.00027653, abs=5e-9)
 
 
 def _magnus(celsius: float) -> float:
@@ -73,35 +66,35 @@ def _birch_and_downs(pascal: float, celsius: float, percent: float, co2: float, 
 )
 def test_the_index_of_any_air(pascal: float, celsius: float, percent: float, co2: float, micrometres: float) -> None:
     wanted = _birch_and_downs(pascal, celsius, percent, co2, micrometres)
-    got = air_index(pascal, 273.15 + celsius, percent, co2, micrometres * 1e-6) - 1.0
+    got = sensor.air_index(pascal, 273.15 + celsius, percent, co2, micrometres * 1e-6) - 1.0
     assert got == pytest.approx(wanted, abs=1e-15 + 1e-12 * wanted)
-    assert saturation_pressure(273.15 + celsius) == pytest.approx(_magnus(celsius), rel=1e-12)
+    assert sensor.saturation_pressure(273.15 + celsius) == pytest.approx(_magnus(celsius), rel=1e-12)
 
 
 def test_what_is_not_reported_of_the_air() -> None:
     """Half saturated, with 450 ppm of carbon dioxide, for the light of a helium-neon laser."""
-    got = air_index(95_000.0, 300.0) - 1.0
+    got = sensor.air_index(95_000.0, 300.0) - 1.0
     assert got == pytest.approx(_birch_and_downs(95_000.0, 26.85, 50.0, 450.0, 0.633), abs=1e-15)
 
 
 @pytest.mark.parametrize('micrometres', [0.45, 0.633, 0.9])
 def test_the_index_by_temperature(micrometres: float) -> None:
     warm, cold = (_birch_and_downs(101_325.0, 26.85 + t, 0.0, 450.0, micrometres) for t in (0.01, -0.01))
-    assert index_per_kelvin(300.0, micrometres * 1e-6) == pytest.approx((warm - cold) / 0.02, rel=1e-5)
-    assert index_per_kelvin(300.0) == index_per_kelvin(300.0, 633e-9)
-    assert index_per_kelvin(293.15) == pytest.approx(-9.3e-7, rel=2e-3)
+    assert sensor.index_per_kelvin(300.0, micrometres * 1e-6) == pytest.approx((warm - cold) / 0.02, rel=1e-5)
+    assert sensor.index_per_kelvin(300.0) == sensor.index_per_kelvin(300.0, 633e-9)
+    assert sensor.index_per_kelvin(293.15) == pytest.approx(-9.3e-7, rel=2e-3)
 
 
 def test_shifts_by_hand() -> None:
-    assert gradient_shift(3e-4, 4.0) == pytest.approx(3e-4 * 16.0 / 2.0)
+    assert sensor.gradient_shift(3e-4, 4.0) == pytest.approx(3e-4 * 16.0 / 2.0)
     inside = math.asin(1.5 * math.sin(0.4) / 1.2)
-    assert boundary_shift(0.4, 1.5, 1.2, 3.0) == pytest.approx(3.0 * (math.tan(inside) - math.tan(0.4)))
+    assert sensor.boundary_shift(0.4, 1.5, 1.2, 3.0) == pytest.approx(3.0 * (math.tan(inside) - math.tan(0.4)))
     # Grazing: the sine of 1 is still an angle, both ways.
-    assert refracted_angle(math.pi / 2.0, 1.5, 1.5) == pytest.approx(math.pi / 2.0)
-    assert refracted_angle(-math.pi / 2.0, 1.5, 1.5) == pytest.approx(-math.pi / 2.0)
+    assert sensor.refracted_angle(math.pi / 2.0, 1.5, 1.5) == pytest.approx(math.pi / 2.0)
+    assert sensor.refracted_angle(-math.pi / 2.0, 1.5, 1.5) == pytest.approx(-math.pi / 2.0)
     for angle in (0.8, -0.8):
         with pytest.raises(ConfigError, match=rf'a beam at {angle:g} rad .* indices 1\.5 and 1$'):
-            refracted_angle(angle, 1.5, 1.0)
+            sensor.refracted_angle(angle, 1.5, 1.0)
 
 
 @pytest.mark.parametrize(('samples', 'frequency', 'rate'), [(20, 57.0, 1000.0), (7, 130.0, 800.0), (3, 999.9, 1000.0)])

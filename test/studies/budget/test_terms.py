@@ -14,22 +14,9 @@ import pytest
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.budget import evaluate as evaluation
 from psd_deflection.studies.budget.budget import BudgetProblem, budget
 from psd_deflection.studies.budget.chain import MeasuringChain, dots, estimator_of, measure
-from psd_deflection.studies.budget.evaluate import (
-    CAUSES,
-    COMPUTATION,
-    Interval,
-    coverage_factor,
-    difference,
-    draws,
-    effective_freedom,
-    evaluate,
-    expanded,
-    interval_of,
-    monte_carlo,
-    stop_window,
-)
 from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
 from psd_deflection.studies.budget.installation import PLANE_TILT
 from psd_deflection.studies.budget.result import Budgeted, in_words, type_of
@@ -55,20 +42,20 @@ def _at_pose(pose: FloatArray, method: str = 'exact', rig: Rig = RIG) -> Situati
 
 def test_every_row_of_table_3_1_is_there() -> None:
     table = {'E_LP', 'E_DC', 'E_R', 'E_TH', 'E_RF', 'E_EMF', 'E_Algn', 'E_Tilt', 'E_C'}
-    assert table <= {c.row for c in CAUSES}
-    names = [c.name for c in CAUSES]
+    assert table <= {c.row for c in evaluation.CAUSES}
+    names = [c.name for c in evaluation.CAUSES]
     assert len(set(names)) == len(names)
 
 
 def test_terms_name_known_inputs_and_inputs_are_used() -> None:
     declared = {i.parameter.name for i in INPUTS}
-    used = {name for c in CAUSES for name in c.inputs}
+    used = {name for c in evaluation.CAUSES for name in c.inputs}
     assert used | {'noise_freedom', 'assumption_doubt'} == declared
-    assert all(c.formula for c in CAUSES)
+    assert all(c.formula for c in evaluation.CAUSES)
     assert all(i.source for i in INPUTS)
 
 
-@pytest.mark.parametrize('cause', [c for c in CAUSES if c.kind is not Kind.KNOWN], ids=lambda c: str(c.name))
+@pytest.mark.parametrize('cause', [c for c in evaluation.CAUSES if c.kind is not Kind.KNOWN], ids=lambda c: str(c.name))
 def test_an_input_that_is_named_has_an_effect(cause: Cause) -> None:
     before = cause.contribution(_at()).rms
     for name in cause.inputs:
@@ -91,8 +78,8 @@ FLOOR = np.array([1e-15, 1e-15, 1e-14])
 )
 def test_first_order_agrees_with_monte_carlo_for_each_cause(load: tuple[float, float, float], method: str) -> None:
     at, wrong = _at(load, method), []
-    for cause in CAUSES:
-        first, sampled = cause.contribution(at), monte_carlo(at, DRAWS, 7, [cause])
+    for cause in evaluation.CAUSES:
+        first, sampled = cause.contribution(at), evaluation.monte_carlo(at, DRAWS, 7, [cause])
         deviation, drawn = (np.sqrt(np.diag(each.covariance)) for each in (first, sampled))
         largest = np.abs(first.bias) * TOLERANCE + 4.0 * deviation / math.sqrt(DRAWS) + FLOOR
         if drawn != pytest.approx(deviation, rel=TOLERANCE, abs=1e-15) or np.any(
@@ -105,7 +92,7 @@ def test_first_order_agrees_with_monte_carlo_for_each_cause(load: tuple[float, f
 @pytest.mark.parametrize('method', ['exact', 'beam', 'wls', 'thesis_iteration'])
 def test_the_total_agrees_with_drawing_everything_at_once(method: str) -> None:
     at = _at(method=method)
-    total, sampled = evaluate(at).total(), monte_carlo(at, DRAWS, 11)
+    total, sampled = evaluation.evaluate(at).total(), evaluation.monte_carlo(at, DRAWS, 11)
     assert sampled.rms == pytest.approx(total.rms, rel=TOLERANCE)
     deviation = np.sqrt(np.diag(total.covariance))
     assert np.all(np.abs(sampled.bias - total.bias) <= 5.0 * deviation / math.sqrt(DRAWS))
@@ -137,9 +124,9 @@ def test_the_stop_rule_is_short_by_its_window(name: str) -> None:
     # The golden answers stop at the first trial within 0.1 mm of agreement, in steps of 0.01 degree.
     dx, dy, _, theta, _, _ = CASES[name]['pose']
     at = _at_pose(np.array([dx, dy, theta]), 'thesis_iteration')
-    got = COMPUTATION.contribution(at)
+    got = evaluation.COMPUTATION.contribution(at)
     stopped = np.array(CASES[name]['iter_22_abs']) - at.pose
-    window = stop_window(RIG.centers, 0.1e-3)
+    window = evaluation.stop_window(RIG.centers, 0.1e-3)
     assert window * MICRO_MILLIDEGREE[2] == pytest.approx(57.30, abs=5e-3)
     step = math.radians(0.01)
     assert window - step - 1e-6 <= abs(stopped[2]) <= window + 1e-6
@@ -152,15 +139,15 @@ def test_the_stop_rule_is_short_by_its_window(name: str) -> None:
 
 @pytest.mark.parametrize(('share', 'short', 'sd'), [(-0.99, 0.99, 0.0), (1.01, 1.0, math.radians(0.01) / 12**0.5)])
 def test_within_the_window_of_its_stop_the_twist_is_not_seen(share: float, short: float, sd: float) -> None:
-    window = stop_window(RIG.centers, 0.1e-3)
-    got = COMPUTATION.contribution(_at_pose(np.array([1e-3, 0.0, share * window]), 'thesis_iteration'))
+    window = evaluation.stop_window(RIG.centers, 0.1e-3)
+    got = evaluation.COMPUTATION.contribution(_at_pose(np.array([1e-3, 0.0, share * window]), 'thesis_iteration'))
     step = math.radians(0.01) if sd else 0.0
     assert got.bias[2] == pytest.approx(-math.copysign(short * window - step / 2.0, share), rel=1e-6)
     assert math.sqrt(got.covariance[2, 2]) == pytest.approx(sd, rel=1e-6, abs=1e-12)
 
 
 def test_shares_add_to_one_where_one_bias_stands_alone() -> None:
-    budget = evaluate(_at())
+    budget = evaluation.evaluate(_at())
     assert np.sum([budget.shares(line) for _, line in budget.lines], axis=0) == pytest.approx(1.0, abs=0.02)
 
 
@@ -285,9 +272,11 @@ def test_the_problem_says_what_is_computed(answer: Budgeted, plain: Budgeted) ->
     assert (plain.sampled, plain.interval, plain.draws, plain.seed, plain.sources) == (None, None, 0, 1, {})
     # Drawn once as normal, and once more as declared.
     assert answer.sampled is not None
-    assert answer.sampled.covariance == pytest.approx(monte_carlo(answer.budget.at, 400, 3).covariance, rel=1e-6)
+    assert answer.sampled.covariance == pytest.approx(
+        evaluation.monte_carlo(answer.budget.at, 400, 3).covariance, rel=1e-6
+    )
     assert answer.interval is not None
-    again = interval_of(draws(answer.budget.at, 400, 3, shaped=True))
+    again = evaluation.interval_of(evaluation.draws(answer.budget.at, 400, 3, shaped=True))
     assert answer.interval.half == pytest.approx(again.half, rel=1e-6)
     assert budget(BudgetProblem(NOISY_RIG, load=LOAD, method='wls')).budget.at.method == 'wls'
     sizes: list[int] = []
@@ -298,7 +287,7 @@ def test_the_problem_says_what_is_computed(answer: Budgeted, plain: Budgeted) ->
 def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain: Budgeted) -> None:
     variances = np.array([np.diag(line.covariance) for _, line in plain.budget.lines])
     bias = np.sum([line.bias for _, line in plain.budget.lines], axis=0)
-    message = expanded(variances, [cause.freedom(plain.budget.at) for cause in CAUSES], bias)
+    message = evaluation.expanded(variances, [cause.freedom(plain.budget.at) for cause in evaluation.CAUSES], bias)
     dx, dy, theta = plain.budget.at.pose.tolist()
     pose = (
         f'ΔX {1e3 * dx:.4f} mm, ΔY {1e3 * dy:.4f} mm, θ {math.degrees(theta):.4f} deg; method exact; mean of 20 samples'
@@ -324,12 +313,12 @@ def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain:
 
 
 def test_without_a_spread_there_is_no_difference() -> None:
-    message = expanded(np.array([[4.0, 4.0, 0.0]]), [math.inf], np.zeros(3))
-    got = difference(message, Interval(np.array([2.0 * 1.959964, 0.0, 0.0]), np.zeros(3)))
+    message = evaluation.expanded(np.array([[4.0, 4.0, 0.0]]), [math.inf], np.zeros(3))
+    got = evaluation.difference(message, evaluation.Interval(np.array([2.0 * 1.959964, 0.0, 0.0]), np.zeros(3)))
     assert got == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
-    assert difference(message, Interval(np.array([1.959964] * 3), np.zeros(3)))[:2] == pytest.approx(
-        [1.0, 1.0], abs=1e-6
-    )
+    assert evaluation.difference(message, evaluation.Interval(np.array([1.959964] * 3), np.zeros(3)))[
+        :2
+    ] == pytest.approx([1.0, 1.0], abs=1e-6)
 
 
 def _same(tree: dict[str, Any], line: Contribution) -> None:
@@ -378,7 +367,7 @@ def test_the_tree_has_every_number(answer: Budgeted, plain: Budgeted) -> None:
 
 def test_the_table_has_a_row_for_every_cause(plain: Budgeted) -> None:
     table = plain.table()
-    assert list(table.index.values) == [cause.name for cause in CAUSES]
+    assert list(table.index.values) == [cause.name for cause in evaluation.CAUSES]
     columns = {column.name: column for column in table.columns}
     assert list(columns) == ['kind', 'freedom', *(f'rms_{a}' for a in AXES), *(f'share_{a}' for a in AXES)]
     assert [columns[f'rms_{a}'].unit for a in AXES] == ['m', 'm', 'rad']
@@ -400,22 +389,24 @@ def _at_sidebar(**settings: float) -> Situation:
 )
 def test_coverage_factors_are_those_of_the_gum(freedom: float, factor: float) -> None:
     """JCGM 100:2008, table G.2, column 95 %."""
-    assert coverage_factor(freedom) == pytest.approx(factor, abs=0.0051)
+    assert evaluation.coverage_factor(freedom) == pytest.approx(factor, abs=0.0051)
 
 
 def test_effective_freedom_is_that_of_the_gum() -> None:
     """The example H.1.6: standard uncertainties in nm with their degrees of freedom give 16.7, so 16."""
     deviations, freedom = (25.0, 9.7, 2.9, 16.6), (18.0, 25.6, 50.0, 2.0)
-    assert effective_freedom([v * v for v in deviations], freedom) == 16.0
+    assert evaluation.effective_freedom([v * v for v in deviations], freedom) == 16.0
     # A known deviation adds to the numerator alone; all known: infinite; never below 1.
-    assert effective_freedom([1.0, 1.0], [3.0, math.inf]) == 12.0
-    assert effective_freedom([1.0, 2.0], [math.inf, math.inf]) == math.inf
-    assert effective_freedom([0.0], [5.0]) == math.inf
-    assert effective_freedom([1.0], [0.5]) == 1.0
+    assert evaluation.effective_freedom([1.0, 1.0], [3.0, math.inf]) == 12.0
+    assert evaluation.effective_freedom([1.0, 2.0], [math.inf, math.inf]) == math.inf
+    assert evaluation.effective_freedom([0.0], [5.0]) == math.inf
+    assert evaluation.effective_freedom([1.0], [0.5]) == 1.0
 
 
 def test_a_bias_that_is_not_corrected_is_added_with_its_size() -> None:
-    message = expanded(np.array([[9.0, 4.0, 1.0], [16.0, 0.0, 0.0]]), [math.inf, 8.0], np.array([0.0, -2.0, 3.0]))
+    message = evaluation.expanded(
+        np.array([[9.0, 4.0, 1.0], [16.0, 0.0, 0.0]]), [math.inf, 8.0], np.array([0.0, -2.0, 3.0])
+    )
     assert message.standard.tolist() == [5.0, 2.0, 1.0]
     # 25^2/(16^2/8) = 19.5.
     assert message.freedom.tolist() == [19.0, math.inf, math.inf]
@@ -427,11 +418,11 @@ def test_draws_have_the_declared_distributions() -> None:
     at = _at_sidebar()
     kurtosis = {Distribution.UNIFORM: 1.8, Distribution.ARCSINE: 1.5, Distribution.NORMAL: 3.0}
     for name in ('sensor_rotation', 'interference', 'quantisation'):
-        cause = next(c for c in CAUSES if c.name == name)
+        cause = next(c for c in evaluation.CAUSES if c.name == name)
         # Of the angle of one detector alone the pose is a straight line; of several a sum of as many.
         parts = [s for s in cause.sensitivities(at) if abs(s.coefficient[0]) > 0.0]
         g = np.array([s.deviation * s.coefficient[0] for s in parts])
-        errors = draws(at, 40_000, 5, [cause], shaped=True)[:, 0]
+        errors = evaluation.draws(at, 40_000, 5, [cause], shaped=True)[:, 0]
         expected = 3.0 + (kurtosis[cause.distribution] - 3.0) * float(np.sum(g**4) / np.sum(g**2) ** 2)
         centred = errors - errors.mean()
         assert np.mean(centred**4) / np.mean(centred**2) ** 2 == pytest.approx(expected, abs=0.12)
@@ -440,8 +431,10 @@ def test_draws_have_the_declared_distributions() -> None:
 
 def test_a_deviation_that_is_hardly_known_is_drawn_wider() -> None:
     at = _at_sidebar()
-    cause = next(c for c in CAUSES if c.name == 'pointing_drift')
-    ratio = draws(at, 40_000, 5, [cause], shaped=True).std(axis=0) / draws(at, 40_000, 5, [cause]).std(axis=0)
+    cause = next(c for c in evaluation.CAUSES if c.name == 'pointing_drift')
+    ratio = evaluation.draws(at, 40_000, 5, [cause], shaped=True).std(axis=0) / evaluation.draws(
+        at, 40_000, 5, [cause]
+    ).std(axis=0)
     # Student's t of 8 degrees of freedom has the variance 8/6.
     assert ratio == pytest.approx(math.sqrt(8.0 / 6.0), rel=0.03)
 
@@ -451,8 +444,8 @@ def test_u_is_half_of_the_drawn_interval() -> None:
     answer = budget(BudgetProblem(RIG, draws=20_000))
     assert answer.interval is not None
     message = answer.budget.expanded()
-    assert np.abs(difference(message, answer.interval)).max() < 0.06
-    errors = draws(answer.budget.at, 20_000, 1, shaped=True)
+    assert np.abs(evaluation.difference(message, answer.interval)).max() < 0.06
+    errors = evaluation.draws(answer.budget.at, 20_000, 1, shaped=True)
     inside = np.abs(errors - answer.interval.middle) <= answer.interval.half
     assert inside.mean(axis=0) == pytest.approx(0.95, abs=1e-4)
     assert any('Supplement 1' in line for line in answer.lines())
@@ -460,6 +453,6 @@ def test_u_is_half_of_the_drawn_interval() -> None:
 
 def test_an_interval_is_that_of_the_middle_95_percent() -> None:
     errors = np.stack([np.linspace(-1.0, 1.0, 100_001), np.linspace(0.0, 4.0, 100_001), np.zeros(100_001)], axis=1)
-    found = interval_of(errors)
+    found = evaluation.interval_of(errors)
     assert found.half == pytest.approx([0.95, 1.9, 0.0])
     assert found.middle == pytest.approx([0.0, 2.0, 0.0], abs=1e-12)

@@ -19,39 +19,11 @@ from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.studies.calibrate import check as checking
+from psd_deflection.studies.calibrate import fit as fitting
+from psd_deflection.studies.calibrate import observation
 from psd_deflection.studies.calibrate.calibrate import OPEN, ROTATED, undetermined, with_clamp
 from psd_deflection.studies.calibrate.check import LEVEL, MovedGroup, fitted_group, moved_group, overall_p
-from psd_deflection.studies.calibrate.fit import (
-    CLAMP_AT,
-    REPORTED,
-    SIZE,
-    CalibrationFit,
-    Kind,
-    Linear,
-    Noise,
-    Prior,
-    deviation_of,
-    fit,
-    linearised,
-    pose_of_readings,
-    posterior,
-    prior_of_rig,
-    score_at,
-    variance_components,
-    weight_matrices,
-    with_common_zero,
-)
-from psd_deflection.studies.calibrate.observation import (
-    CALM_LEAST,
-    CalibrationRun,
-    Rows,
-    at_rest,
-    joined,
-    noise_of,
-    rest_means,
-    rows_of,
-    smoothed,
-)
+from psd_deflection.studies.calibrate.fit import SIZE
 from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress, progress_of
 from psd_deflection.studies.calibrate.result import result
 from tools.program import ROOT
@@ -65,7 +37,7 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
     true = rng.uniform(-1.0, 1.0, (3, 3)) * (1e-3, 1e-3, 5e-3)
     sd = np.array([2e-6, 20e-6, 8e-6, 1e-6]) * rng.uniform(0.5, 2.0, (3, 4))
     dots = misaligned.dots(misaligned.nominal(), true) + sd * rng.normal(size=sd.shape)
-    found = pose_of_readings(dots, sd**2, p, length)
+    found = fitting.pose_of_readings(dots, sd**2, p, length)
 
     def misfit(pose: FloatArray, row: int) -> float:
         residual = (dots[row] - misaligned.dots(misaligned.nominal(), pose[None])[0]) / sd[row]
@@ -84,7 +56,7 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
 def test_clamp_prior_is_a_fifth_of_link_compliance() -> None:
     """In the deflection by a tip force, L^3/3EI, and in the twist by a moment, L/GJ."""
     rig = rig_from_values({})
-    bends, twists = prior_of_rig(rig).sd[CLAMP_AT : CLAMP_AT + 2]
+    bends, twists = fitting.prior_of_rig(rig).sd[fitting.CLAMP_AT : fitting.CLAMP_AT + 2]
     length = rig.link.length
     assert bends * length**2 == pytest.approx(0.2 * length**3 / (3.0 * rig.link.bending_stiffness))
     assert twists == pytest.approx(0.2 * length / rig.link.torsional_stiffness)
@@ -93,15 +65,15 @@ def test_clamp_prior_is_a_fifth_of_link_compliance() -> None:
 def test_rows_that_are_worth_fewer_weigh_less() -> None:
     rng = np.random.default_rng(4)
     rows = cast(Any, SimpleNamespace(sd=np.ones((5, 3)), variances=rng.uniform(1.0, 2.0, (5, 4)) * 1e-12))
-    linear = Linear(np.zeros((5, 4)), np.zeros((5, 4, 2)), rng.normal(size=(5, 4, 3)))
-    noise = Noise(np.array([1e-6, 2e-6, 3e-6]), 1.5)
-    each = weight_matrices(linear, rows, noise)
+    linear = fitting.Linear(np.zeros((5, 4)), np.zeros((5, 4, 2)), rng.normal(size=(5, 4, 3)))
+    noise = fitting.Noise(np.array([1e-6, 2e-6, 3e-6]), 1.5)
+    each = fitting.weight_matrices(linear, rows, noise)
     covariance = linear.pose_slopes[2] @ np.diag(noise.reference**2) @ linear.pose_slopes[2].T
     np.testing.assert_allclose(each[2], np.linalg.inv(covariance + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
-    np.testing.assert_allclose(weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)
+    np.testing.assert_allclose(fitting.weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)
 
 
-def rows_of_two(offset: FloatArray) -> Rows:
+def rows_of_two(offset: FloatArray) -> observation.Rows:
     """Two recordings of one rig; the readings of the second are off by ``offset`` (4,), m."""
     rng, n = np.random.default_rng(8), 120
     pose = rng.uniform(-1.0, 1.0, (n, 3)) * (3e-3, 3e-3, 2e-2)
@@ -112,18 +84,23 @@ def rows_of_two(offset: FloatArray) -> Rows:
     loads, velocity = rng.uniform(-10.0, 10.0, (n, 3)), rng.normal(size=(n, 3)) * 1e-3
     pose += rng.normal(size=(n, 3)) * (2e-5, 2e-5, 2e-4)
     moved, nothing = np.full((n, 4), 1e-12), np.zeros(n, dtype=bool)
-    return Rows(np.linspace(0.0, 11.9, n), run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3)))
+    return observation.Rows(
+        np.linspace(0.0, 11.9, n), run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3))
+    )
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
-def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: Kind) -> None:
+def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind) -> None:
     """Score and information are those of dense least squares with four more unknowns, less those (Schur)."""
     rows, rig = rows_of_two(np.full(4, 1e-4)), rig_from_values({})
-    prior, weights = prior_of_rig(rig), np.random.default_rng(1).uniform(0.1, 1.0, len(rows_of_two(np.zeros(4))))
-    noise, none = Noise(np.array([3e-5, 2e-5, 1e-4]), 1.5, 2.0), np.zeros((SIZE, SIZE))
-    linear = linearised(rows, prior.mean, rig, kind)
-    best = CalibrationFit(prior.mean, none, none, linear, weights, noise, np.ones(SIZE, dtype=bool))
-    score, information = score_at(rows, prior.mean, rig, kind, best)
+    prior, weights = (
+        fitting.prior_of_rig(rig),
+        np.random.default_rng(1).uniform(0.1, 1.0, len(rows_of_two(np.zeros(4)))),
+    )
+    noise, none = fitting.Noise(np.array([3e-5, 2e-5, 1e-4]), 1.5, 2.0), np.zeros((SIZE, SIZE))
+    linear = fitting.linearised(rows, prior.mean, rig, kind)
+    best = fitting.CalibrationFit(prior.mean, none, none, linear, weights, noise, np.ones(SIZE, dtype=bool))
+    score, information = fitting.score_at(rows, prior.mean, rig, kind, best)
     normal, right = np.zeros((SIZE + 4, SIZE + 4)), np.zeros(SIZE + 4)
     normal[SIZE:, SIZE:] = np.diag(TOLERANCES[ZERO:COUNT] ** -2)
     for j in range(len(rows)):
@@ -136,7 +113,9 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: Kind) -> Non
     size = np.sqrt(np.abs(np.diag(normal[:SIZE, :SIZE]))) + 1e-30
     scale = np.outer(size, size)
     np.testing.assert_allclose(
-        information / scale, (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale, atol=1e-8
+        information / scale,
+        (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale,
+        atol=1e-8,
     )
     reach = np.abs(right).max() + np.abs(right[:SIZE] / size).max() * size
     np.testing.assert_allclose(score / reach, (right[:SIZE] - gain @ right[SIZE:]) / reach, atol=1e-8)
@@ -145,16 +124,16 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: Kind) -> Non
 def test_two_recordings_have_one_zero_after_the_offset_is_taken_off() -> None:
     """A zero moves readings under load by nearly as much: what is left is the dots' noise and its mean's."""
     offset, rig = np.array([4e-5, -3e-5, 2e-5, 5e-5]), rig_from_values({})
-    prior = prior_of_rig(rig)
+    prior = fitting.prior_of_rig(rig)
     free = np.zeros(SIZE, dtype=bool)
     free[ZERO:COUNT] = True
-    rows, best = with_common_zero(rows_of_two(offset), rig, prior, 'reference', free)
+    rows, best = fitting.with_common_zero(rows_of_two(offset), rig, prior, 'reference', free)
     np.testing.assert_allclose(rows.dots, rows_of_two(np.zeros(4)).dots, atol=6e-6)
     assert best.noise.reference == pytest.approx([2e-5, 2e-5, 2e-4], rel=0.25)
     assert best.noise.dots == pytest.approx(1.0, rel=0.25)
-    again = fit(rows, rig, prior, 'reference', free=free)
+    again = fitting.fit(rows, rig, prior, 'reference', free=free)
     np.testing.assert_allclose(best.values[ZERO:COUNT], again.values[ZERO:COUNT], atol=1e-8)
-    np.testing.assert_allclose(best.covariance, posterior(best.information, prior, free), rtol=1e-9)
+    np.testing.assert_allclose(best.covariance, fitting.posterior(best.information, prior, free), rtol=1e-9)
     assert not np.any(best.values[:ZERO] - prior.mean[:ZERO])
 
 
@@ -162,14 +141,14 @@ def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
     free = np.zeros(SIZE, dtype=bool)
     free[: ZERO // 2] = True
     rig = rig_from_values({})
-    found = fit(rows_of_two(np.zeros(4)), rig, prior_of_rig(rig), 'self', free=free).noise
+    found = fitting.fit(rows_of_two(np.zeros(4)), rig, fitting.prior_of_rig(rig), 'self', free=free).noise
     assert (found.reference.tolist(), found.fewer) == ([1.0, 1.0, 1.0], 1.0)
     assert found.dots == pytest.approx(1.0, rel=0.15)
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
 @pytest.mark.parametrize(('share', 'reported'), [(0.0, 0.3), (0.2, 0.3), (0.4, 0.4), (2.0, 2.0)])
-def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: float, reported: float) -> None:
+def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: fitting.Kind, share: float, reported: float) -> None:
     """The redundant reading has ``share`` of the noise that is stated, of either sign; nothing was fitted."""
     rng = np.random.default_rng(6)
     n, sd = 200, 3e-6
@@ -182,9 +161,9 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: 
     rows = cast(
         Any, SimpleNamespace(sd=np.ones((n, 3)), variances=np.full((n, 4), sd**2), run=np.zeros(n, dtype=np.int64))
     )
-    linear = Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
-    prior = prior_of_rig(rig_from_values({}))
-    found = variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
+    linear = fitting.Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
+    prior = fitting.prior_of_rig(rig_from_values({}))
+    found = fitting.variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
     assert found.dots == pytest.approx(reported)
 
 
@@ -209,7 +188,7 @@ def on_curves(t: FloatArray, derivative: int = 0) -> FloatArray:
 
 
 def test_polynomial_of_fit_degree_is_found_with_slope() -> None:
-    found = smoothed(on_curves(T), PERIOD, WHERE)
+    found = observation.smoothed(on_curves(T), PERIOD, WHERE)
     assert found.good.all()
     scale = np.abs(on_curves(T)).max()
     np.testing.assert_allclose(found.dots, on_curves(WHERE * PERIOD), atol=1e-9 * scale)
@@ -218,7 +197,7 @@ def test_polynomial_of_fit_degree_is_found_with_slope() -> None:
 
 
 def test_gain_is_value_variance_over_sample_variance() -> None:
-    found = smoothed(np.zeros((200, 4)), PERIOD, WHERE)
+    found = observation.smoothed(np.zeros((200, 4)), PERIOD, WHERE)
     for place, gain in zip(WHERE, found.gain, strict=True):
         middle = round(place)
         u = np.arange(-10, 11) / 10.0
@@ -229,7 +208,7 @@ def test_gain_is_value_variance_over_sample_variance() -> None:
 
 def test_over_an_exposure_it_is_the_mean() -> None:
     exposure = 0.008
-    found = smoothed(on_curves(T), PERIOD, WHERE, exposure)
+    found = observation.smoothed(on_curves(T), PERIOD, WHERE, exposure)
     at = (np.arange(4000) + 0.5) / 4000 - 0.5
     means = [on_curves(place * PERIOD + exposure * at).mean(axis=0) for place in WHERE]
     np.testing.assert_allclose(found.dots, means, atol=1e-6 * np.abs(means).max())
@@ -237,18 +216,18 @@ def test_over_an_exposure_it_is_the_mean() -> None:
 
 def test_a_place_needs_seventeen_samples_about_it_on_both_sides() -> None:
     dots = np.zeros((200, 4))
-    assert smoothed(dots, PERIOD, np.array([0.0, 5.0, 6.0, 193.0, 194.0, 199.0])).good.tolist() == [
+    assert observation.smoothed(dots, PERIOD, np.array([0.0, 5.0, 6.0, 193.0, 194.0, 199.0])).good.tolist() == [
         *(False, False, True, True, False, False)
     ]
     dots[95:99] = np.nan
-    assert smoothed(dots, PERIOD, np.array([100.0])).good.all()
+    assert observation.smoothed(dots, PERIOD, np.array([100.0])).good.all()
     dots[99] = np.nan
-    assert not smoothed(dots, PERIOD, np.array([100.0])).good.any()
-    assert not smoothed(np.zeros((200, 4)), PERIOD, np.array([-3.0])).good.any()
+    assert not observation.smoothed(dots, PERIOD, np.array([100.0])).good.any()
+    assert not observation.smoothed(np.zeros((200, 4)), PERIOD, np.array([-3.0])).good.any()
 
 
-def run_of(volts: FloatArray, loads: FloatArray | None = None) -> CalibrationRun:
-    return CalibrationRun('x', seconds(len(volts)), volts, np.zeros(0), np.zeros((0, 3)), loads)
+def run_of(volts: FloatArray, loads: FloatArray | None = None) -> observation.CalibrationRun:
+    return observation.CalibrationRun('x', seconds(len(volts)), volts, np.zeros(0), np.zeros((0, 3)), loads)
 
 
 def lit(n: int, noise: tuple[float, float, float, float], seed: int = 1) -> FloatArray:
@@ -259,21 +238,21 @@ def lit(n: int, noise: tuple[float, float, float, float], seed: int = 1) -> Floa
 
 def test_the_noise_of_each_channel_is_found() -> None:
     noise = (1e-3, 2e-3, 4e-3, 8e-3)
-    assert noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
+    assert observation.noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
 
 
 def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
     # The first hold is of 1024 steps of 1/1024 s, without a rounding; the second is too short, the third of 1499.
     t, loads = seconds(3000, 1.0 / 1024.0), np.zeros((3000, 3))
     loads[1025:1500, 0] = 5.0
-    assert np.flatnonzero(at_rest(loads, t)).tolist() == [*range(512, 1025), *range(2250, 3000)]
-    assert not at_rest(None, t).any()
+    assert np.flatnonzero(observation.at_rest(loads, t)).tolist() == [*range(512, 1025), *range(2250, 3000)]
+    assert not observation.at_rest(None, t).any()
 
 
 def test_rows_without_reference_are_one_per_block() -> None:
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     loads = np.tile([0.0, -5.0, 1.0], (2000, 1))
-    rows = rows_of(run_of(lit(2000, (0.0, 0.0, 0.0, 0.0)), loads), RIG, noise)
+    rows = observation.rows_of(run_of(lit(2000, (0.0, 0.0, 0.0, 0.0)), loads), RIG, noise)
     assert len(rows) == 100
     np.testing.assert_allclose(np.diff(rows.t), 0.02, rtol=1e-9)
     assert np.all(rows.loads == [0.0, -5.0, 1.0])
@@ -294,12 +273,14 @@ def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
     zeros, run = np.zeros((100, 3)), np.zeros(100, dtype=np.int64)
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     for variances in (small, large):
-        rows = Rows(t, run, zeros, dots, variances, zeros, loads, t >= 0.5, np.ones((100, 3)))
-        found = rest_means(rows, RIG, noise)
+        rows = observation.Rows(t, run, zeros, dots, variances, zeros, loads, t >= 0.5, np.ones((100, 3)))
+        found = observation.rest_means(rows, RIG, noise)
         assert len(found) >= 6
         assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
         if variances is small:
-            np.testing.assert_allclose(found.variances, np.tile((5e-4 * noise) ** 2 * CALM_LEAST, (len(found), 1)))
+            np.testing.assert_allclose(
+                found.variances, np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(found), 1))
+            )
         else:
             # Twelve or thirteen rows in a quarter of a second.
             assert 1e-10 / 13.001 < found.variances.min() <= np.median(found.variances) < 1e-10 / 11.999
@@ -312,29 +293,29 @@ def test_references_count_by_their_proportions_if_all_state_them() -> None:
     zeros, run = np.zeros((4, 3)), np.zeros(4, dtype=np.int64)
     rest = np.ones(4, dtype=bool)
 
-    def rows(sd: float) -> Rows:
+    def rows(sd: float) -> observation.Rows:
         dots = np.zeros((4, 4))
-        return Rows(seconds(4, 1.0), run, zeros, dots, dots + 1.0, zeros, zeros, rest, np.full((4, 3), sd))
+        return observation.Rows(seconds(4, 1.0), run, zeros, dots, dots + 1.0, zeros, zeros, rest, np.full((4, 3), sd))
 
-    both = joined([rows(1e-6), rows(3e-6), rows(3e-6)])
+    both = observation.joined([rows(1e-6), rows(3e-6), rows(3e-6)])
     assert both.run.tolist() == [0] * 4 + [1] * 4 + [2] * 4
     assert sorted(set(both.sd.ravel().round(9).tolist())) == pytest.approx([1.0 / 3.0, 1.0])
-    assert np.all(joined([rows(1e-6), rows(np.nan)]).sd == 1.0)
+    assert np.all(observation.joined([rows(1e-6), rows(np.nan)]).sd == 1.0)
 
 
 def test_half_of_the_deviations_report_that_of_all() -> None:
     values = np.random.default_rng(3).normal(0.0, 2.0, 20_000)
-    assert deviation_of(values, False) == pytest.approx(2.0, rel=0.02)
-    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.03)
+    assert fitting.deviation_of(values, False) == pytest.approx(2.0, rel=0.02)
+    assert fitting.deviation_of(values, True) == pytest.approx(2.0, rel=0.03)
     values[::10] += 1000.0
-    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
+    assert fitting.deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
 
 
 def test_the_steps_of_the_converter_are_no_noise() -> None:
     rig = rig_from_values({'converter.bits': 10})
     step = 20.0 / 1024.0
     volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
-    assert noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
+    assert observation.noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -356,11 +337,11 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
 
 
 def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
-    reported = prior_of_rig(rig_from_values({}))
+    reported = fitting.prior_of_rig(rig_from_values({}))
     names = [p.name for p in PARAMETERS if p.group == 'psd_1.gain']
-    given: list[Prior] = []
+    given: list[fitting.Prior] = []
 
-    def explained(rows: object, rig: object, prior: Prior, *_: object) -> tuple[float, FloatArray]:
+    def explained(rows: object, rig: object, prior: fitting.Prior, *_: object) -> tuple[float, FloatArray]:
         given.append(prior)
         return 7.0, prior.mean + 0.5
 
@@ -394,7 +375,7 @@ def test_at_most_5_percent_of_sound_rigs_are_reported(shared: float, least: floa
 
 
 def test_uninformed_parameters_are_undetermined() -> None:
-    prior = prior_of_rig(rig_from_values({}))
+    prior = fitting.prior_of_rig(rig_from_values({}))
     size = len(prior.mean)
     free = np.ones(size, dtype=bool)
     each = 1e4 / prior.sd**2
@@ -407,7 +388,7 @@ def test_uninformed_parameters_are_undetermined() -> None:
     information[[a, b], [a, b]] = 0.0
     information += 1e4 * np.outer(pair, pair)
     full = cast(
-        Any, SimpleNamespace(covariance=posterior(information, prior, free), information=information, free=free)
+        Any, SimpleNamespace(covariance=fitting.posterior(information, prior, free), information=information, free=free)
     )
     found = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, prior)}
     assert set(found) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
@@ -417,7 +398,7 @@ def test_uninformed_parameters_are_undetermined() -> None:
 
 def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
     rig = rig_from_values({})
-    prior = prior_of_rig(rig)
+    prior = fitting.prior_of_rig(rig)
     n, size = 40, len(prior.mean)
     rng = np.random.default_rng(7)
     loads = np.column_stack([rng.uniform(-50.0, 50.0, (n, 2)), rng.uniform(-20.0, 20.0, n)])
@@ -429,13 +410,15 @@ def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
     weights[3] = 0.0
     rest, run = np.ones(n, dtype=bool), np.zeros(n, dtype=np.int64)
     seconds = np.asarray(0.02 * np.arange(n), dtype=np.float64)
-    rows = Rows(seconds, run, pose, np.zeros((n, 4)), np.ones((n, 4)), zeros, loads, rest, zeros + 1.0)
-    linear = Linear(np.zeros((n, 4)), np.zeros((n, 4, size)), np.zeros((n, 4, 3)))
+    rows = observation.Rows(seconds, run, pose, np.zeros((n, 4)), np.ones((n, 4)), zeros, loads, rest, zeros + 1.0)
+    linear = fitting.Linear(np.zeros((n, 4)), np.zeros((n, 4, size)), np.zeros((n, 4, 3)))
     free = np.zeros(size, dtype=bool)
-    noise = Noise(np.array([1e-7, 1e-7, 1e-7]))
-    full = CalibrationFit(np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free)
+    noise = fitting.Noise(np.array([1e-7, 1e-7, 1e-7]))
+    full = fitting.CalibrationFit(
+        np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free
+    )
     found = with_clamp(full, rows, rig, prior)
-    assert found.values[CLAMP_AT : CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
+    assert found.values[fitting.CLAMP_AT : fitting.CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
 
 
 def calibrated(*loads: tuple[float, float, float]) -> CalibrationProgress:
@@ -447,7 +430,7 @@ def calibrated(*loads: tuple[float, float, float]) -> CalibrationProgress:
 @pytest.mark.slow
 def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
     along_x, all_round = calibrated((40, 0, 0)), calibrated((40, 0, 0), (0, -50, -29), (-40, 40, 20))
-    assert len(along_x.parameters) == len(REPORTED)
+    assert len(along_x.parameters) == len(fitting.REPORTED)
     assert along_x.determined < all_round.determined
     for progress in (along_x, all_round):
         assert ROTATED not in [need.motion for need in progress.needs]

@@ -320,6 +320,7 @@ NAN = math.nan
         ((1e3, NAN, 1e3), {0: 'kN instead of N', 2: 'kN m instead of N m'}),
         ((4.45, 4.44, 0.0981), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'kg cm instead of N m'}),
         ((NAN, 1 / 9.80665, NAN), {1: 'N, and then converted from kg once more'}),
+        ((0.278, 0.28, NAN), {0: 'ozf instead of N', 1: 'ozf instead of N'}),
         ((NAN, NAN, 0.01), {2: 'N cm instead of N m'}),
         ((NAN, NAN, 100.0), {2: 'N m, and then converted from N cm once more'}),
         # Beside forces in grams a torque has their unit if that fits, though newton centimetres are nearer.

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Levels, drift, answers to loads, wirings, and the verdict and findings on them: of volts that are made by hand."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,6 +19,7 @@ from psd_deflection.studies.check import result as module
 from psd_deflection.studies.check.checkup import CheckProblem, check, responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup, Levels, levels
 from psd_deflection.studies.check.wirings import (
+    WIRINGS,
     Difference,
     PushResponse,
     differences,
@@ -28,6 +30,7 @@ from psd_deflection.studies.check.wirings import (
     parameters,
     pattern,
     scales_of,
+    wirings_of,
 )
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 
@@ -296,6 +299,19 @@ def test_three_pushes_leave_one_wiring_and_two_leave_several() -> None:
     # The one load that went the other way, of two and of three.
     for rows in ([('fx', 1.0), ('tz', -10.0)], [('fx', 1.0), ('fy', 1.0), ('tz', -10.0)]):
         assert {f.reversed_loads for f in fitting_wirings(of_plate(*rows))} <= {('tz',), ('fx',), ('fx', 'fy')}
+
+
+def test_wirings_have_two_wrong_psds_or_all_alike() -> None:
+    nominal = Wiring(axes=(('x', 'y'),) * 3)
+    each = [wiring.axes[0] for wiring in WIRINGS[:64:8]]
+    all_of_three = set(itertools.product(each, repeat=3))
+    few = {a for a in all_of_three if sum(axes != ('x', 'y') for axes in a) <= 2 or len(set(a)) == 1}
+    tried = wirings_of(nominal)
+    assert len(tried) == len(set(tried)) == 4 * len(few)
+    for swap in ((False, ()), (True, ()), (False, (1, 3)), (False, (2, 3))):
+        assert {w.axes for w in tried if (w.exchanged, w.crossed) == swap} == few
+    assert tried[0] == nominal
+    assert wirings_of(Wiring()) is WIRINGS
 
 
 def test_each_difference_has_the_line_that_puts_it_right() -> None:

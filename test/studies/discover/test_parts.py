@@ -32,15 +32,6 @@ from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
 from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation
 from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import SearchResult
-from psd_deflection.studies.discover.search.weighing import (
-    Alternative,
-    CommonCause,
-    NamedEffect,
-    Tie,
-    Unknown,
-    coincidences,
-    ties,
-)
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.steps import (
     alternatives,
@@ -381,7 +372,7 @@ def test_predictions_are_asked_for_beyond_one_and_a_half_floors(level: float, as
     after = predict(searched)
     assert ('predicting' in words) is (after.predictive is not None) is asked
     # What is unknown is asked for, however little.
-    unknown = dataclasses.replace(searched, unknown=(Unknown('x', (), 0.1),))
+    unknown = dataclasses.replace(searched, unknown=(weighing.Unknown('x', (), 0.1),))
     assert predict(unknown).predictive is not None
 
 
@@ -619,13 +610,13 @@ def stiffness(name: str, scale: float, moves: int = 0) -> ActiveEffect:
     return make_active(f'{name}_stiffness', {'scale': scale, 'moves_frequency': moves}, 'test')
 
 
-def named(active: ActiveEffect, sd: float, *alternatives: Alternative) -> NamedEffect:
+def named(active: ActiveEffect, sd: float, *alternatives: weighing.Alternative) -> weighing.NamedEffect:
     amplitude = next(p.name for p in active.effect.parameters if p.kind == 'amplitude')
-    return NamedEffect(active, {amplitude: sd}, 1e-9, 50.0, HeldOut(9.0, 1.0), (), alternatives, (), None)
+    return weighing.NamedEffect(active, {amplitude: sd}, 1e-9, 50.0, HeldOut(9.0, 1.0), (), alternatives, (), None)
 
 
 def test_radius_material_or_loads_explain_stiffnesses() -> None:
-    (tie,) = ties([named(stiffness('bending', -0.04), 1e-4), named(stiffness('torsional', -0.0401), 1e-4)])
+    (tie,) = weighing.ties([named(stiffness('bending', -0.04), 1e-4), named(stiffness('torsional', -0.0401), 1e-4)])
     assert tie.share == pytest.approx(-0.04005)
     radius, loads = tie.causes
     assert (radius.name, loads.name) == ('link_radius', 'load_unit')
@@ -641,25 +632,27 @@ def test_radius_material_or_loads_explain_stiffnesses() -> None:
 
 
 def test_if_the_modes_moved_it_is_not_the_loads() -> None:
-    (tie,) = ties([named(stiffness('torsional', 0.02, 1), 1e-5), named(stiffness('bending', 0.02, 1), 1e-5)])
+    (tie,) = weighing.ties([named(stiffness('torsional', 0.02, 1), 1e-5), named(stiffness('bending', 0.02, 1), 1e-5)])
     assert [c.name for c in tie.causes] == ['link_radius']
     assert 'Not the loads' in tie.sentence
-    assert ties([named(stiffness('torsional', 0.02, 0), 1e-5), named(stiffness('bending', 0.02, 1), 1e-5)]) == ()
+    assert (
+        weighing.ties([named(stiffness('torsional', 0.02, 0), 1e-5), named(stiffness('bending', 0.02, 1), 1e-5)]) == ()
+    )
 
 
 def test_a_rival_may_be_the_half_of_a_tie() -> None:
     clamp = make_active('clamp_torsional_compliance', {'compliance': 2e-5}, 'test')
-    alternative = Alternative(stiffness('torsional', -0.04), {'scale': 1e-5}, 0.0, FIT)
-    (tie,) = ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8, alternative)])
+    alternative = weighing.Alternative(stiffness('torsional', -0.04), {'scale': 1e-5}, 0.0, FIT)
+    (tie,) = weighing.ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8, alternative)])
     assert tie.share == pytest.approx(-0.04)
-    assert ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8)]) == ()
+    assert weighing.ties([named(stiffness('bending', -0.04), 1e-5), named(clamp, 1e-8)]) == ()
 
 
 @pytest.mark.parametrize(
     ('other', 'sd'), [(-0.041, 1e-5), (0.04, 1e-5), (-0.04, 0.01), (-0.04, 0.0)], ids=('off', 'sign', 'vague', 'fixed')
 )
 def test_shares_that_differ_or_are_vague_are_no_tie(other: float, sd: float) -> None:
-    assert ties([named(stiffness('bending', -0.04), 1e-5), named(stiffness('torsional', other), sd)]) == ()
+    assert weighing.ties([named(stiffness('bending', -0.04), 1e-5), named(stiffness('torsional', other), sd)]) == ()
 
 
 @pytest.mark.parametrize(('second', 'count'), [('torsional_stiffness', 0), ('axis_crosstalk', 1)])
@@ -668,14 +661,14 @@ def test_a_tie_of_known_cause_is_not_called_unknown(second: str, count: int) -> 
     effects = (stiffness('bending', -0.04), make_active(second, values, 'test'))
     free = ((0, 'scale'), (1, 'scale' if count == 0 else 'xy'))
     fit = Fit(effects, 0.0, np.zeros(2), [], 1e4 * np.eye(2), free, ())
-    assert len(coincidences(fit, None)) == count
+    assert len(weighing.coincidences(fit, None)) == count
 
 
 def test_the_deviation_of_a_tie_is_reported_in_per_cent() -> None:
-    cause = CommonCause('link_radius', 1.0, 1e-3)
-    assert '(2 ± 1 %)' in Tie(0.02, 0.0149, True, (cause,)).sentence
+    cause = weighing.CommonCause('link_radius', 1.0, 1e-3)
+    assert '(2 ± 1 %)' in weighing.Tie(0.02, 0.0149, True, (cause,)).sentence
 
 
 def test_a_stiffness_without_a_deviation_is_the_half_of_no_tie() -> None:
     without = dataclasses.replace(named(stiffness('torsional', -0.04), 1e-5), sd={})
-    assert ties([named(stiffness('bending', -0.04), 1e-5), without]) == ()
+    assert weighing.ties([named(stiffness('bending', -0.04), 1e-5), without]) == ()

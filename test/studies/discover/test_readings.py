@@ -3,7 +3,6 @@
 """Tables of readings, a row for each load that hung; recordings of loads and a reference; rigs of three PSDs."""
 
 import dataclasses
-import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from psd_deflection.recordings.write.bag_writer import McapFile
 from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, TemperatureReading, dot_names
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
+from psd_deflection.studies.check.wirings import differences, fix_of, parameters
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.plants import CHANNELS, Readings, ReadingsPlant
@@ -376,19 +375,6 @@ def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
     right = make_observation(file)
     read = dataclasses.replace(right, volts=Wiring.from_rig(file).to_psds(right.volts))
     assert correct_wiring([read], ())[1:] == ([], {})
-
-
-def test_wirings_have_two_wrong_psds_or_all_alike() -> None:
-    nominal = Wiring(axes=(('x', 'y'),) * 3)
-    each = [wiring.axes[0] for wiring in WIRINGS[:64:8]]
-    all_of_three = set(itertools.product(each, repeat=3))
-    few = {a for a in all_of_three if sum(axes != ('x', 'y') for axes in a) <= 2 or len(set(a)) == 1}
-    tried = wirings_of(nominal)
-    assert len(tried) == len(set(tried)) == 4 * len(few)
-    for swap in ((False, ()), (True, ()), (False, (1, 3)), (False, (2, 3))):
-        assert {w.axes for w in tried if (w.exchanged, w.crossed) == swap} == few
-    assert tried[0] == nominal
-    assert wirings_of(Wiring()) is WIRINGS
 
 
 def test_what_is_wired_otherwise_is_reported_of_any_psd() -> None:

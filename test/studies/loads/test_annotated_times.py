@@ -593,6 +593,15 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8400)) == [3.01]
 
 
+@pytest.mark.parametrize(('longer', 'fitted'), [(0, 0), (1, 2)])
+def test_right_times_are_fitted_if_steps_are_long(longer: int, fitted: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    long = 2 * round(4.0 / RIG.dynamics.bending_frequency * 1000.0) + 100 + longer
+    steps = [DotStep(at, 1.0, int(at), int(at) + long) for at in (3000.0, 8000.0)]
+    between = with_pieces(monkeypatch, steps, {3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
+    assert correct_loads(RIG, np.zeros((20_000, 4)), annotated_at(3000, 8000)) is None
+    assert len(between) == fitted
+
+
 @pytest.mark.parametrize(('share', 'rough'), [(0.99, False), (1.01, True)])
 def test_ringing_beyond_the_noise_of_the_blocks_is_rough(share: float, rough: bool) -> None:
     """Blocks of +-1 um differ by 2 um: a variance of 2 um^2, ``ROUGH`` squared of which may ring."""

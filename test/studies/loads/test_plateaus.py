@@ -252,6 +252,20 @@ def test_wrong_loads_need_five_right_ones_beside_them(
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
+def test_beside_loads_within_their_tolerance_six_must_be_right() -> None:
+    for count, gone in ((7, (2,)), (6, ())):
+        found = plateaus.outliers(observed({2: (0.0, 10.0, 0.0)}, VARIED[:count], everywhere=0.2))
+        assert (found.gone, found.softer) == (gone, 0.0)
+
+
+@pytest.mark.parametrize(('torque', 'gone'), [(2.4, (2,)), (2.6, ())])
+def test_load_is_known_if_others_leave_a_twentieth_of_it(torque: float, gone: tuple[int, ...]) -> None:
+    # The only torque, beside a force of 50 N: a twentieth of both is 2.503.
+    annotated = VARIED * (1.0, 1.0, 0.0)
+    annotated[2, 2] = torque
+    assert plateaus.outliers(observed({2: (0.0, 1.0, 0.0)}, annotated)).gone == gone
+
+
 def test_a_faulty_detector_is_no_wrong_note() -> None:
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
@@ -370,6 +384,13 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
     for one in found:
         assert one.applied == pytest.approx(VARIED[one.plateau.number], abs=0.05)
         assert one.period == 1e-3
+
+
+def test_right_notes_are_right_however_nonlinear_the_simulation() -> None:
+    annotated = np.clip(VARIED, -5.0, 5.0)
+    annotated[2] = (0.0, -80.0, 0.0)
+    asked = world(annotated, annotated, np.zeros((3, 3)), offset=0.01, bend=0.8)
+    assert plateaus.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked) == []
 
 
 ONE_TORQUE = np.array(

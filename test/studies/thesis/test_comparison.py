@@ -16,39 +16,9 @@ from psd_deflection.model.link.section import TubeSection
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers.interface import SolverStatus
 from psd_deflection.model.solvers.registry import SOLVERS, make_solver
-from psd_deflection.studies.scaling import (
-    BASE_SECTION,
-    COLUMNS,
-    ERRATA_B1,
-    ERRATA_B2,
-    FORCE,
-    MATERIALS,
-    YOUNGS_MODULUS,
-    TableCell,
-    round_as,
-    table_b1,
-    table_b1_cases,
-    table_b2,
-    torsion_to_bending_ratio,
-    torsion_to_bending_ratio_exact,
-)
+from psd_deflection.studies import scaling
+from psd_deflection.studies.thesis import comparison
 from psd_deflection.studies.thesis.appendix_d import compared, mismatch, tilt_branches
-from psd_deflection.studies.thesis.comparison import (
-    CAUSES,
-    CONDITIONS,
-    DIAMETERS,
-    FORCES,
-    VARIANCES,
-    Method,
-    dots_of,
-    errors,
-    methods,
-    rejected,
-    spot_changes,
-    spot_run,
-    table_5_1,
-    thesis_geometry,
-)
 
 Cell = tuple[float, float, float]
 
@@ -88,10 +58,10 @@ LARGEST: dict[str, tuple[Cell, Cell, Cell]] = {
 UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])
 
 
-@pytest.mark.parametrize('method', [m for m in methods() if m.label in AUDIT], ids=lambda m: m.label)
-def test_the_audits_table(method: Method) -> None:
-    for i, condition in enumerate(CONDITIONS):
-        got = errors(method, condition)
+@pytest.mark.parametrize('method', [m for m in comparison.methods() if m.label in AUDIT], ids=lambda m: m.label)
+def test_the_audits_table(method: comparison.Method) -> None:
+    for i, condition in enumerate(comparison.CONDITIONS):
+        got = comparison.errors(method, condition)
         np.testing.assert_allclose(got.rms * UNITS, AUDIT[method.label][i], rtol=5e-4, atol=5e-4)
         if method.label in LARGEST:
             np.testing.assert_allclose(got.largest * UNITS, LARGEST[method.label][i], rtol=6e-4, atol=5e-4)
@@ -122,20 +92,20 @@ TABLE_5_1: dict[str, tuple[Cell, Cell]] = {
 
 @pytest.mark.parametrize('label', TABLE_5_1)
 def test_table_5_1_by_cause(label: str) -> None:
-    cause = next(c for c in CAUSES if c.label == label)
-    got = table_5_1(cause)
+    cause = next(c for c in comparison.CAUSES if c.label == label)
+    got = comparison.table_5_1(cause)
     np.testing.assert_allclose(100.0 * np.array(got), TABLE_5_1[label], atol=0.06)
 
 
 def test_printed_search_without_a_hit_has_no_numbers() -> None:
-    solver = make_solver('iterative_printed', thesis_geometry(), criterion='absolute')
-    found = solver.solve((5e-3, 5e-3, -5e-3, -5e-3), tuple(VARIANCES.tolist()))
+    solver = make_solver('iterative_printed', comparison.thesis_geometry(), criterion='absolute')
+    found = solver.solve((5e-3, 5e-3, -5e-3, -5e-3), tuple(comparison.VARIANCES.tolist()))
     assert (found.status, found.phi, found.omega, found.iterations) == (SolverStatus.NO_HIT, 0.0, 0.0, 401)
     assert np.isnan([found.dx, found.dy, found.theta, *found.covariance, *found.residual]).all()
 
 
 def test_every_method_is_a_row_or_is_rejected_with_a_reason() -> None:
-    rows, without = [m.name for m in methods()], rejected()
+    rows, without = [m.name for m in comparison.methods()], comparison.rejected()
     assert {*rows, *without} >= set(SOLVERS)
     assert not {*rows} & {*without}
     assert all(without.values())
@@ -144,14 +114,14 @@ def test_every_method_is_a_row_or_is_rejected_with_a_reason() -> None:
 CONSTANTS: dict[str, Any] = json.loads(
     (Path(__file__).parents[2] / 'data' / 'golden.json').read_text(encoding='utf-8')
 )['constants']
-CASES = table_b1_cases()
+CASES = scaling.table_b1_cases()
 
 FITTED_YOUNGS_MODULUS = 68.9e9
 """Pa: the value that Table B1's bending deflections of cases 1 and 5 were computed with (an erratum)."""
 
 
 @pytest.mark.parametrize(
-    ('modulus', 'key'), [(YOUNGS_MODULUS, 'table_b1_E69'), (FITTED_YOUNGS_MODULUS, 'table_b1_E68.9')]
+    ('modulus', 'key'), [(scaling.YOUNGS_MODULUS, 'table_b1_E69'), (FITTED_YOUNGS_MODULUS, 'table_b1_E68.9')]
 )
 def test_table_b1_at_full_precision(modulus: float, key: str) -> None:
     rows = [
@@ -162,14 +132,14 @@ def test_table_b1_at_full_precision(modulus: float, key: str) -> None:
             link.section.polar_moment,
             link.section.outer_radius,
             link.section.inner_radius,
-            link.bending(FORCE),
-            link.twist(FORCE),
-            link.tip_by_twist(FORCE),
-            link.tip_by_twist(FORCE, small_angle=True),
-            link.tip_total(FORCE),
-            link.tip_total(FORCE, small_angle=True),
+            link.bending(scaling.FORCE),
+            link.twist(scaling.FORCE),
+            link.tip_by_twist(scaling.FORCE),
+            link.tip_by_twist(scaling.FORCE, small_angle=True),
+            link.tip_total(scaling.FORCE),
+            link.tip_total(scaling.FORCE, small_angle=True),
         ]
-        for number, _, link in table_b1_cases(modulus)
+        for number, _, link in scaling.table_b1_cases(modulus)
     ]
     assert len(rows) == len(CONSTANTS[key])
     for row, golden in zip(rows, CONSTANTS[key], strict=True):
@@ -177,71 +147,75 @@ def test_table_b1_at_full_precision(modulus: float, key: str) -> None:
 
 
 def test_table_b1_cells_agree_or_are_explained_errata() -> None:
-    cells = table_b1()
-    assert [(c.row, c.column) for c in cells] == [(str(n), column) for n in range(1, 7) for column in COLUMNS]
-    assert {(int(c.row), c.column) for c in cells if not c.agrees} == set(ERRATA_B1)
+    cells = scaling.table_b1()
+    assert [(c.row, c.column) for c in cells] == [(str(n), column) for n in range(1, 7) for column in scaling.COLUMNS]
+    assert {(int(c.row), c.column) for c in cells if not c.agrees} == set(scaling.ERRATA_B1)
     assert all(c.erratum for c in cells if not c.agrees)
 
 
 def _explained(number: int, column: str) -> Decimal:
     """The value that the reason given for an erratum says was printed."""
     case = CASES[number - 1].link
-    fitted = table_b1_cases(FITTED_YOUNGS_MODULUS)[number - 1].link
-    loose = TubeSection.from_mean(2.0 * round(BASE_SECTION.mean_radius, 5), BASE_SECTION.wall)
+    fitted = scaling.table_b1_cases(FITTED_YOUNGS_MODULUS)[number - 1].link
+    loose = TubeSection.from_mean(2.0 * round(scaling.BASE_SECTION.mean_radius, 5), scaling.BASE_SECTION.wall)
     value = {
-        (1, 'bend'): fitted.bending(FORCE),
-        (2, 'D total'): 1e3 * case.tip_total(FORCE, small_angle=True),
+        (1, 'bend'): fitted.bending(scaling.FORCE),
+        (2, 'D total'): 1e3 * case.tip_total(scaling.FORCE, small_angle=True),
         (5, 'I'): loose.second_moment,
         (5, 'J'): loose.polar_moment,
-        (5, 'bend'): fitted.bending(FORCE),
+        (5, 'bend'): fitted.bending(scaling.FORCE),
         (6, 'J'): 2.0 * 3.47e-7,
     }[number, column]
-    return round_as(value, next(c.printed for c in table_b1() if (c.row, c.column) == (str(number), column)))
+    return scaling.round_as(
+        value, next(c.printed for c in scaling.table_b1() if (c.row, c.column) == (str(number), column))
+    )
 
 
-@pytest.mark.parametrize(('number', 'column'), list(ERRATA_B1))
+@pytest.mark.parametrize(('number', 'column'), list(scaling.ERRATA_B1))
 def test_the_reason_of_an_erratum_gives_the_printed_value(number: int, column: str) -> None:
-    printed = next(c.printed for c in table_b1() if (c.row, c.column) == (str(number), column))
+    printed = next(c.printed for c in scaling.table_b1() if (c.row, c.column) == (str(number), column))
     assert _explained(number, column) == Decimal(printed)
 
 
 def test_table_b2() -> None:
-    cells = table_b2()
+    cells = scaling.table_b2()
     assert {c.row: c.computed for c in cells} == pytest.approx(CONSTANTS['tbr'], rel=1e-15)
-    assert [c.row for c in cells if not c.agrees] == list(ERRATA_B2)
-    assert round_as(cells[-1].computed, '1.68') == Decimal('1.64')
+    assert [c.row for c in cells if not c.agrees] == list(scaling.ERRATA_B2)
+    assert scaling.round_as(cells[-1].computed, '1.68') == Decimal('1.64')
 
 
 def test_ratio_depends_on_link_lengths_unless_equal() -> None:
     # Conclusion 3 of the appendix holds only because L_CD = L_BC.
-    aluminium = MATERIALS[0]
-    one = torsion_to_bending_ratio(aluminium.youngs_modulus, aluminium.shear_modulus)
+    aluminium = scaling.MATERIALS[0]
+    one = scaling.torsion_to_bending_ratio(aluminium.youngs_modulus, aluminium.shear_modulus)
     link = CASES[0].link
     force, length_cd = 1e-3, 0.3
     statics = link.statics
     by_twist = length_cd * statics.deflection(0.0, 0.0, force * length_cd)[2]
     bending = statics.deflection(0.0, force, 0.0)[1]
     assert by_twist / bending == pytest.approx(one * (length_cd / link.length) ** 2, rel=1e-12)
-    assert torsion_to_bending_ratio(69e9, 24e9, length_cd / link.length) == pytest.approx(by_twist / bending, rel=1e-12)
+    assert scaling.torsion_to_bending_ratio(69e9, 24e9, length_cd / link.length) == pytest.approx(
+        by_twist / bending, rel=1e-12
+    )
 
 
 def test_the_sine_form_of_the_ratio() -> None:
     # With the extra L inside the sine, as B-5 prints it first, it would be 2.52.
     link = CASES[0].link
-    assert torsion_to_bending_ratio_exact(link, FORCE) == pytest.approx(4.312221, abs=5e-7)
-    printed = math.sin(link.twist(FORCE) * link.length) * link.length / link.bending(FORCE)
+    assert scaling.torsion_to_bending_ratio_exact(link, scaling.FORCE) == pytest.approx(4.312221, abs=5e-7)
+    printed = math.sin(link.twist(scaling.FORCE) * link.length) * link.length / link.bending(scaling.FORCE)
     assert printed == pytest.approx(2.52, abs=5e-3)
 
 
 def test_a_cell_is_compared_at_the_digits_that_are_printed() -> None:
-    assert TableCell('', '', 0.0799, '0.08', '').agrees
-    assert not TableCell('', '', 0.0799, '0.080001', '').agrees
-    assert round_as(2.6726e-3, '2.68e-3') == Decimal('2.67e-3')
+    assert scaling.TableCell('', '', 0.0799, '0.08', '').agrees
+    assert not scaling.TableCell('', '', 0.0799, '0.080001', '').agrees
+    assert scaling.round_as(2.6726e-3, '2.68e-3') == Decimal('2.67e-3')
 
 
 def test_while_the_weight_is_held_larger_dots_change_nothing() -> None:
     """As the thesis says: the dots are 2.7 mm and more from the edges of the sensors, which is 2.7 radii."""
-    for c in spot_changes():
+    for c in comparison.spot_changes():
         np.testing.assert_allclose(c.error[1], c.error[0], atol=1e-9)
 
 
@@ -250,19 +224,21 @@ def test_overshoot_of_larger_weight_alone_reaches_edge() -> None:
 
     The part of a dot of 2 mm that lies beyond 5 mm is not read.
     """
-    for c in spot_changes():
+    for c in comparison.spot_changes():
         assert (c.largest[1] > 1e-5) == (c.force == 50.0)
         assert c.largest[1] < 5e-5
-    peak = spot_run(50.0, DIAMETERS[1]).truth[:, 1].min()
+    peak = comparison.spot_run(50.0, comparison.DIAMETERS[1]).truth[:, 1].min()
     assert -3.9e-3 < peak < -3.7e-3
 
 
-@pytest.mark.parametrize('force', FORCES)
+@pytest.mark.parametrize('force', comparison.FORCES)
 def test_least_squares_error_is_its_neglected_rotation(force: float) -> None:
     """theta dY less theta^2/2 of 100 mm, on dX; the iteration here has none."""
-    truth = spot_run(force, DIAMETERS[0]).truth[-50:].mean(axis=0)
-    (least_squares,) = (c for c in spot_changes() if (c.force, c.method) == (force, 'weighted least squares'))
-    (iteration,) = (c for c in spot_changes() if (c.force, c.method) == (force, 'iteration'))
+    truth = comparison.spot_run(force, comparison.DIAMETERS[0]).truth[-50:].mean(axis=0)
+    (least_squares,) = (
+        c for c in comparison.spot_changes() if (c.force, c.method) == (force, 'weighted least squares')
+    )
+    (iteration,) = (c for c in comparison.spot_changes() if (c.force, c.method) == (force, 'iteration'))
     assert truth[0] == pytest.approx(0.12e-3 * force / 50.0, rel=0.01)
     by_hand = truth[2] * truth[1] - 0.5 * truth[2] ** 2 * 0.1
     assert least_squares.error[0][0] == pytest.approx(by_hand, rel=0.02)
@@ -342,7 +318,7 @@ def test_corrected_equations_hold_printed_root_never() -> None:
     sums_hold = 0
     for _ in range(300):
         pose = rng.uniform(-1.0, 1.0, 5) * (5e-3, 5e-3, *degrees(3, 1, 1))
-        for row in compared(thesis_geometry(), pose):
+        for row in compared(comparison.thesis_geometry(), pose):
             assert row.corrected == pytest.approx(row.true, abs=2e-9), row
             assert np.isnan(row.printed) == row.equation.startswith('2.38')
             if row.equation.startswith('2.41'):
@@ -354,7 +330,7 @@ def test_corrected_equations_hold_printed_root_never() -> None:
 def test_the_stopping_test_holds_at_every_admissible_trial() -> None:
     """So it selects no twist: from a thousandth of a degree below the true one to twenty above."""
     pose = np.array([1e-3, -2e-3, *degrees(1, 0.5, -0.3)])
-    (dots,) = dots_of(thesis_geometry(), pose[None]).tolist()
+    (dots,) = comparison.dots_of(comparison.thesis_geometry(), pose[None]).tolist()
     for off in (-0.001, 0.0, 0.01, 1.0, 5.0, 20.0):
-        assert mismatch(thesis_geometry(), tuple(dots), pose[2] + np.radians(off)) < 1e-16
-    assert mismatch(thesis_geometry(), tuple(dots), pose[2] - np.radians(0.01)) == np.inf
+        assert mismatch(comparison.thesis_geometry(), tuple(dots), pose[2] + np.radians(off)) < 1e-16
+    assert mismatch(comparison.thesis_geometry(), tuple(dots), pose[2] - np.radians(0.01)) == np.inf
