@@ -107,6 +107,7 @@ def main(argv: list[str] | None = None) -> int:
     job = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']['apt']
     row = next(row for row in job['strategy']['matrix']['include'] if row['ros'] == 'jazzy')
     env = {'ROS': 'jazzy', 'RUNNER_TEMP': '/root/temp', 'ROS_OS_OVERRIDE': 'ubuntu:24.04:noble'}
+    env['ROS_DOMAIN_ID'] = os.environ.get('ROS_DOMAIN_ID', '0')
     env |= {'PATH': '/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin', **ready(chroot, options.ros, options.rosdistro)}
     words = ' '.join(f"'{name}={value}'" for name, value in env.items())
     failed = 0
