@@ -32,7 +32,7 @@ for word in "$@"; do
       : >"/var/lib/dpkg/info/$word.list"
       printf 'Package: %s\nStatus: install ok installed\nVersion: 1\nArchitecture: all\n' "$word" >>/var/lib/dpkg/status
       printf 'Maintainer: none\nDescription: none\n\n' >>/var/lib/dpkg/status;;
-    python3-colcon-common-extensions) words+=(colcon python3-colcon-{defaults,library-path,notification,output} \
+    python3-colcon-common-extensions) words+=(colcon python3-colcon-{bash,defaults,library-path,notification,output} \
       python3-colcon-{package-information,package-selection,parallel-executor,recursive-crawl,ros,test-result});;
     *) words+=("$word");;
   esac
