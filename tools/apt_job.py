@@ -63,7 +63,7 @@ apt-get update -qq
 apt-get install -qq --no-install-recommends build-essential ca-certificates git libxml2-utils \
     python3-{argcomplete,dev,empy,importlib-metadata,lark,netifaces,osrf-pycommon,pip,psutil,rosdep2,venv}
 python3 -m pip install --quiet --break-system-packages -c /opt/ubuntu-24.04.txt \
-    numpy scipy pyserial PyYAML ruamel.yaml tqdm zstandard aiohttp jsonschema==4.10.3 setuptools==68.1.2 \
+    numpy scipy pandas pyserial PyYAML ruamel.yaml tqdm zstandard aiohttp hypothesis==6.98.15 jsonschema==4.10.3 setuptools==68.1.2 \
     pytest==7.4.4 pytest-xdist==3.4.0 pytest-timeout==2.2.0
 """
 """What the image of ROS has, and the versions of Ubuntu 24.04 over those of Debian."""
@@ -98,7 +98,7 @@ def ready(chroot: Path, ros: Path, rosdistro: Path) -> dict[str, str]:
 def main(argv: list[str] | None = None) -> int:
     """Prints what became of each step; the exit status is 1 where one failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('ros', type=Path, help='what stands for /opt/ros/jazzy: wheels; sources of ros2cli and launch')
+    parser.add_argument('ros', type=Path, help='what stands for /opt/ros/jazzy (docs/releasing.md)')
     parser.add_argument('rosdistro', type=Path, help='a checkout of ros/rosdistro')
     parser.add_argument('--chroot', type=Path, default=ROOT / 'build/apt_job')
     parser.add_argument('--skip', default='', help='a step to leave out')
