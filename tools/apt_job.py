@@ -54,7 +54,6 @@ STAND_INS = {
     'opt/ros/jazzy/setup.bash': SETUP,
     'opt/ros/jazzy/lib/tf2_ros/static_transform_publisher': '#!/bin/sh\necho publishing nothing\nexec sleep infinity\n',
     'opt/ros/jazzy/share/ament_index/resource_index/packages/tf2_ros': '',
-    'etc/hosts': '127.0.0.1 localhost\n',
     'etc/xml/catalog': CATALOGUE,
     'usr/local/bin/apt-get': APT,
 }
