@@ -22,7 +22,7 @@ from psd_deflection.base import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.rig.declarations import BY_NAME
 from tools import pages, run_commands
-from tools.program import ROOT
+from tools.program import PSD_DEFLECTION, ROOT
 from tools.run_commands import FENCE, PAGES
 
 ALL = list(run_commands.commands())
@@ -338,7 +338,7 @@ def test_the_lines_run(tmp_path: Path) -> None:
     programs = f'{Path(sys.executable).parent}:/usr/bin:/bin'
     for line in lines:
         done = subprocess.run(
-            ['bash', '-e', '-c', line],
+            ['bash', '-e', '-c', line.replace('psd-deflection ', f'{shlex.join(PSD_DEFLECTION)} ')],
             cwd=tmp_path,
             capture_output=True,
             text=True,
