@@ -137,6 +137,7 @@ SIGNIFICANT_DRIFT = 5e-6 / 60.0
 """m/s: a drift whose standard deviation is larger is not shown; the recording is too short."""
 
 NAMES = {
+    'channel_skew': 'on another clock',
     'channel_sign': 'sign turned',
     'axis_swap': 'x and y exchanged',
     'psd_swap': 'exchanged',

@@ -6,19 +6,22 @@ The default answer is "nothing missing". A discrepancy that no effect explains i
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.check.shared_findings import noise_findings, step_findings
+from psd_deflection.studies.check.result import Finding
+from psd_deflection.studies.check.shared_findings import note_finding, noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.applied import (
     directions,
@@ -31,6 +34,7 @@ from psd_deflection.studies.discover.applied import (
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, LoadDirection
 from psd_deflection.studies.discover.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.problem import Problem, Progress
+from psd_deflection.studies.discover.recorded import Recorded
 from psd_deflection.studies.discover.recorded_rig import (
     RecordedRig,
     proposals_of,
@@ -57,6 +61,7 @@ from psd_deflection.studies.discover.steps import (
     where,
     without_effect,
 )
+from psd_deflection.studies.loads.alignment import SKEW
 from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded
 
@@ -374,6 +379,8 @@ def set_up(problem: Problem) -> Problem:
             values |= lines
     setup += wrong_load_findings(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
+    clocks, named = _clocks(machine.recorded, named)
+    setup = [*clocks, *setup]
     if machine.recorded.value_grid is not None and not machine.recorded.value_grid_stated:
         value_grid = machine.recorded.value_grid
         named.append(_named_value_grid(ws, value_grid))
@@ -391,6 +398,28 @@ def set_up(problem: Problem) -> Problem:
         values=values,
         stated_gap=machine.recorded.stated_gap,
     )
+
+
+def _clocks(recorded: Recorded, named: list[NamedEffect]) -> tuple[list[Finding], list[NamedEffect]]:
+    """Return what was said of PSDs on another clock: findings, or, where a simulation can do it, effects before others.
+
+    ``named``: among these what the search has found beside whole samples.
+    """
+    findings, effects = list[Finding](), list[NamedEffect]()
+    apart = [(o, late) for o, listed in zip(recorded.observations, recorded.late, strict=False) for late in listed]
+    beside = {n.active.values['psd']: n for n in named if n.name == SKEW}
+    alike = len(apart) == len({(late.psd, late.rows) for _, late in apart}) * len(recorded.observations)
+    for o, late in apart:
+        more = beside.get(late.psd)
+        value = late.value if more is None else late.rows * o.period + more.active.values['delay']
+        least, most = catalogue()[SKEW].parameter('delay').bounds(Physics.of(o.rig), {})
+        if not alike or SKEW in recorded.without or not least <= value <= most:
+            findings.append(note_finding(replace(late, value=value), o.name))
+        elif o is recorded.observations[0]:
+            active = ActiveEffect(catalogue()[SKEW], {'psd': float(late.psd), 'delay': value})
+            effects.append(_named_by_readings(active, {'delay': late.sd} if more is None else more.sd, 0.5 * late.size))
+    moved = {late.psd for _, late in apart}
+    return findings, [*effects, *(n for n in named if n.name != SKEW or n.active.values['psd'] not in moved)]
 
 
 def noise_level(problem: Problem) -> Problem:
@@ -429,11 +458,17 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
 
 def _named_value_grid(workspace: Workspace, value_grid: ActiveEffect) -> NamedEffect:
     """Return the named effect of coarse steps, which the readings themselves show."""
-    gain = value_grid_gain(workspace, value_grid)
     sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
+    return _named_by_readings(
+        value_grid, {value_grid.effect.value_grid: sd}, value_grid_gain(workspace, value_grid)
+    )
+
+
+def _named_by_readings(active: ActiveEffect, sd: Mapping[str, float], gain: float) -> NamedEffect:
+    """Return an effect that the readings show without any search, by a log-likelihood of ``gain``."""
     return NamedEffect(
-        active=value_grid,
-        sd={value_grid.effect.value_grid: sd},
+        active=active,
+        sd=sd,
         p=0.0,
         delta_bic=2.0 * gain,
         heldout=HeldOut(gain, float(np.sqrt(2.0 * gain))),

@@ -29,6 +29,7 @@ from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, likely_delays
+from psd_deflection.studies.loads.alignment import LatePsd, aligned
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads
 from psd_deflection.studies.loads.effective import (
     SwayingLoad,
@@ -56,7 +57,7 @@ class Recorded:
     ``value_grid_stated``: the rig file has it.
     ``delays``: by how much the loads may be noted late, s. ``corrected``: of each recording, its loads as they were put
     right, if they were. ``wrong``: where another load hung than noted; it is free.
-    ``fourth``: what the readings say of themselves.
+    ``fourth``: what the readings say of themselves. ``late``: the PSDs of each recording that were on another clock.
     """
 
     observations: tuple[Observation, ...]
@@ -72,6 +73,7 @@ class Recorded:
     corrected: tuple[CorrectedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
     fourth: FourthReading | None = None
+    late: tuple[tuple[LatePsd, ...], ...] = ()
 
     @property
     def stated(self) -> tuple[ActiveEffect, ...]:
@@ -86,7 +88,7 @@ class Recorded:
     @property
     def mistaken(self) -> bool:
         """Whether anything was noted or wired otherwise than it was."""
-        return bool(self.findings) or any(m is not None and m.notes for m in self.corrected)
+        return bool(self.findings or self.late) or any(m is not None and m.notes for m in self.corrected)
 
     def delayed_loads(self, workspace: Workspace) -> list[Finding]:
         """Loads that acted at another time than noted; ``workspace``: where their times were fitted."""
@@ -110,12 +112,25 @@ def cleaned(recorded: Recorded) -> Recorded:
     )
 
 
+def on_one_clock(recorded: Recorded) -> Recorded:
+    """With the readings of all PSDs at the same times, to the nearest sample."""
+    results = [aligned(o.rig, o.volts, o.loads) for o in recorded.observations]
+    late = tuple(late for _, late in results)
+    if not any(late):
+        return recorded
+    stated = Workspace(recorded.observations, recorded.known)
+    both = zip(recorded.observations, results, strict=True)
+    observations = tuple(_with_volts(o, volts) if late_of_recording else o for o, (volts, late_of_recording) in both)
+    gap = stated.gap(stated.residual(recorded.known)[1])
+    return replace(recorded, observations=observations, late=late, stated_gap=gap)
+
+
 def put_right(recorded: Recorded) -> Recorded:
     """With loads at the times at which they acted, and with wiring, signs and units as they are."""
     timed = [time_loads(o) for o in recorded.observations]
     observations, wrong, lines = correct_wiring([o for o, _ in timed], recorded.known)
-    gap = 0.0
-    if wrong or any(corrected is not None and corrected.notes for _, corrected in timed):
+    gap = recorded.stated_gap
+    if not gap and (wrong or any(corrected is not None and corrected.notes for _, corrected in timed)):
         stated = Workspace(recorded.observations, recorded.known)
         gap = stated.gap(stated.residual(recorded.known)[1])
     values = {**recorded.values, **lines}
@@ -166,7 +181,7 @@ def _on_steps(volts: FloatArray, rows: list[int], step: float) -> FloatArray:
     return out
 
 
-STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, put_right, snapped)
+STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, on_one_clock, put_right, snapped)
 
 
 def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
