@@ -40,19 +40,19 @@ REPEATS = 'the motion repeats itself, so several shifts fit'
 class TimeShift(NamedTuple):
     """``seconds``: by how much the second set is later than the first; ``sd``: its standard deviation, s.
 
-    ``evidence``: twice the log-likelihood ratio against the stated shift; 0 if that is not excluded. ``unknown``: why
-    the motion does not determine the shift, '' if it does.
+    ``unshared``: share of the movement of their most correlated combinations that the two do not share. ``evidence``:
+    twice the log-likelihood ratio against the stated shift; 0 if that is not excluded. ``unknown``: why the motion does
+    not determine the shift, '' if it does.
     """
 
     seconds: float
     sd: float
+    unshared: float = 1.0
     evidence: float = 0.0
     unknown: str = ''
 
 
-def time_shift(
-    first: FloatArray, second: FloatArray, period: float, reach: float, stated: float = 0.0
-) -> TimeShift:
+def time_shift(first: FloatArray, second: FloatArray, period: float, reach: float, stated: float = 0.0) -> TimeShift:
     """Return by how much ``second`` (n, q) is later than ``first`` (n, p): rows ``period`` s apart, NaN if lost.
 
     ``reach``: the largest shift of either sign, s; of a short recording a third of its length. ``stated``: what the
@@ -67,7 +67,10 @@ def time_shift(
     window = slice(most * step, len(a) - most * step, step)
     inside = a[::step].copy()
     inside[: window.start // step] = inside[-(-window.stop // step) :] = np.nan
-    unshared = _shares(*_sums_of_shifts(inside, b[::step], most))
+    counts, *sums = _sums_of_shifts(inside, b[::step], most)
+    unshared = _shares(*sums)
+    # Few movements fit anything.
+    unshared[counts < 0.5 * counts.max()] = 1.0
     best = int(np.argmin(np.log(unshared).sum(axis=1)))
 
     def pair(shift: int) -> tuple[FloatArray, FloatArray]:
@@ -98,7 +101,7 @@ def time_shift(
     sd = float(np.hypot(np.sqrt(2.0 / curvature), INTERPOLATION))
     said = min(max(round(stated / period), -most * step), most * step)
     against = float(evidence(_shares(*_sums(*pair(said))))[0])
-    return TimeShift(float(shift * period), sd * period, against if against >= EVIDENCE else 0.0)
+    return TimeShift(float(shift * period), sd * period, float(fine[at, 0]), against if against >= EVIDENCE else 0.0)
 
 
 def _movements(x: FloatArray, width: int) -> FloatArray:
@@ -120,8 +123,11 @@ def _sums(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     return (a.T @ a)[None], (b.T @ b)[None], (a.T @ b)[None]
 
 
-def _sums_of_shifts(a: FloatArray, b: FloatArray, most: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same of ``a[i]`` and ``b[i + k]`` for each shift k from ``-most`` to ``most``, by Fourier transforms."""
+def _sums_of_shifts(a: FloatArray, b: FloatArray, most: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The same of ``a[i]`` and ``b[i + k]`` for each shift k from ``-most`` to ``most``, by Fourier transforms.
+
+    First the number of rows of each.
+    """
     size = 1 << (len(a) + most).bit_length()
 
     def products(x: FloatArray) -> FloatArray:
@@ -141,7 +147,8 @@ def _sums_of_shifts(a: FloatArray, b: FloatArray, most: int) -> tuple[FloatArray
     squares_a = over_shifts(ours[:, 1 + p :], theirs[:, :1]).reshape(-1, p, p)
     squares_b = over_shifts(ours[:, :1], theirs[:, 1 + q :]).reshape(-1, q, q)
     crossed = [over_shifts(ours[:, 1 + i : 2 + i], theirs[:, 1 : 1 + q]) for i in range(p)]
-    return squares_a, squares_b, np.stack(crossed, axis=1)
+    counts = over_shifts(ours[:, :1], theirs[:, :1])[:, 0]
+    return counts, squares_a, squares_b, np.stack(crossed, axis=1)
 
 
 def _shares(squares_a: FloatArray, squares_b: FloatArray, crossed: FloatArray) -> FloatArray:
@@ -162,9 +169,9 @@ def _canonical(
 
 
 def _ridge(squares: FloatArray) -> FloatArray:
-    """What keeps a channel that does not move from being infinitely sure."""
-    size = LEAST * np.trace(squares, axis1=1, axis2=2) + 1e-300
-    return np.asarray(size[:, None, None] * np.eye(squares.shape[1]))
+    """What keeps a channel that does not move, or the rounding of the transforms, from being infinitely sure."""
+    size = LEAST * float(np.trace(squares, axis1=1, axis2=2).max()) + 1e-300
+    return size * np.eye(squares.shape[1])
 
 
 def _effective_values(a: FloatArray, b: FloatArray, memory: int) -> FloatArray:

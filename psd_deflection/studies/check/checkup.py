@@ -44,8 +44,8 @@ from psd_deflection.studies.check.wirings import (
     pattern,
     scales_of,
 )
-from psd_deflection.studies.loads.annotated_times import CorrectedNote, correct_loads
 from psd_deflection.studies.loads.alignment import LatePsd, aligned
+from psd_deflection.studies.loads.annotated_times import CorrectedNote, correct_loads
 from psd_deflection.studies.loads.effective import LoadNote, effective_loads
 from psd_deflection.studies.loads.steps import link_motion
 

@@ -408,8 +408,9 @@ def _setup(discovery: RigConclusion) -> str:
 
 
 def _seconds(finding: Finding) -> str:
-    """How late a load was noted, or how long it took."""
-    if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_delay', 'load_ramp'):
+    """How late a load was noted or a PSD is, or how long a load took."""
+    late = ('channel_skew', 'load_time', 'load_delay', 'load_ramp')
+    if not isinstance(finding.value, float) or finding.name not in late:
         return ''
     direction = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
     return f'{abs(finding.value):.3g} s{direction}'

@@ -21,7 +21,7 @@ from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.check.shared_findings import note_finding, noise_findings, step_findings
+from psd_deflection.studies.check.shared_findings import noise_findings, note_finding, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.applied import (
     directions,
@@ -459,9 +459,7 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
 def _named_value_grid(workspace: Workspace, value_grid: ActiveEffect) -> NamedEffect:
     """Return the named effect of coarse steps, which the readings themselves show."""
     sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
-    return _named_by_readings(
-        value_grid, {value_grid.effect.value_grid: sd}, value_grid_gain(workspace, value_grid)
-    )
+    return _named_by_readings(value_grid, {value_grid.effect.value_grid: sd}, value_grid_gain(workspace, value_grid))
 
 
 def _named_by_readings(active: ActiveEffect, sd: Mapping[str, float], gain: float) -> NamedEffect:
