@@ -58,6 +58,8 @@ def time_shift(first: FloatArray, second: FloatArray, period: float, reach: floa
     ``reach``: the largest shift of either sign, s; of a short recording a third of its length. ``stated``: what the
     shift is said to be, s.
     """
+    finer = int(np.ceil(0.99 * period / STEP_S))
+    first, second, period = _between(first, finer), _between(second, finer), period / finer
     step, width = max(1, round(STEP_S / period)), max(1, round(MEAN_S / period))
     a, b = (_movements(x, width)[: MOST_VALUES * step] for x in (first, second))
     most = min(round(reach / period / step), len(a) // step // 3)
@@ -92,16 +94,27 @@ def time_shift(first: FloatArray, second: FloatArray, period: float, reach: floa
     possible = evidence(np.maximum(unshared - missed, fine[at])) < EVIDENCE
     if possible.all() or fine[at, 0] > UNSHARED:
         return TimeShift(0.0, 0.0, unknown=AT_REST)
-    if possible[0] or possible[-1] or np.count_nonzero(np.diff(possible.astype(np.int8)) == 1) > 1:
+    apart = np.count_nonzero(np.diff(possible.astype(np.int8)) == 1) > 1
+    if possible[0] or possible[-1] or apart or _better_elsewhere(a, b, int(near[at]), step, int(possible.sum())):
         return TimeShift(0.0, 0.0, unknown=REPEATS)
     # Squares of what is unshared, in units of their noise, are a parabola about the shift.
     before, here, after = fine[at - 1 : at + 2] / fine[at] @ values
     curvature = max(before - 2.0 * here + after, 1e-9)
     shift = float(near[at]) + 0.5 * (before - after) / curvature
-    sd = float(np.hypot(np.sqrt(2.0 / curvature), INTERPOLATION))
+    sd = float(np.hypot(np.sqrt(2.0 / curvature), INTERPOLATION * finer))
     said = min(max(round(stated / period), -most * step), most * step)
     against = float(evidence(_shares(*_sums(*pair(said))))[0])
     return TimeShift(float(shift * period), sd * period, float(fine[at, 0]), against if against >= EVIDENCE else 0.0)
+
+
+def _between(x: FloatArray, finer: int) -> FloatArray:
+    """``x`` (n, k) with straight lines between its rows, ``finer`` rows for one: slow readings move far in a sample."""
+    if finer < 2:
+        return x
+    at = np.arange((len(x) - 1) * finer + 1) / finer
+    before = np.minimum(at.astype(np.int64), len(x) - 2)
+    share = (at - before)[:, None]
+    return np.asarray((1.0 - share) * x[before] + share * x[before + 1])
 
 
 def _movements(x: FloatArray, width: int) -> FloatArray:
@@ -149,6 +162,16 @@ def _sums_of_shifts(a: FloatArray, b: FloatArray, most: int) -> tuple[FloatArray
     crossed = [over_shifts(ours[:, 1 + i : 2 + i], theirs[:, 1 : 1 + q]) for i in range(p)]
     counts = over_shifts(ours[:, :1], theirs[:, :1])[:, 0]
     return counts, squares_a, squares_b, np.stack(crossed, axis=1)
+
+
+def _better_elsewhere(a: FloatArray, b: FloatArray, shift: int, step: int, around: int) -> bool:
+    """Whether, of all that both have, another shift of up to half of it leaves less unshared, ``around`` steps away."""
+    ours, theirs = a[::step], b[shift % step :: step]
+    counts, *sums = _sums_of_shifts(ours, theirs, len(ours) // 2)
+    shares, here = _shares(*sums)[:, 0], shift // step + len(ours) // 2
+    others = counts > 0.4 * counts.max()
+    others[max(here - around, 0) : here + around + 1] = False
+    return bool((shares[others] < shares[here]).any())
 
 
 def _shares(squares_a: FloatArray, squares_b: FloatArray, crossed: FloatArray) -> FloatArray:

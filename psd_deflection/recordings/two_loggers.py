@@ -20,8 +20,9 @@ from psd_deflection.recordings.read.csv_reader import CsvRecording
 from psd_deflection.recordings.time_shift import REPEATS, TimeShift, time_shift
 from psd_deflection.records import FloatArray, IntArray, RawChunk, channel_names
 
-STRETCH_S = 60.0
-"""The motion of so long a part tells the time between the clocks; a third of it is the largest that is found."""
+STRETCH_S, REACHES_S = 60.0, (2.0, 5.0, 20.0)
+"""The motion of so long a part tells the time between the clocks, s: beside the starts, up to one of these, and a third
+of the part."""
 PIECE_S, MOST_PIECES = 10.0, 16
 """Pieces of at least this length, at most so many, tell the difference of the clocks' rates."""
 NEAR_S = 0.2
@@ -32,6 +33,8 @@ DRIFT = 5e-4
 """Largest difference of the rates of two clocks."""
 SURE = 3.0
 """Standard deviations by which the rates differ, or they are taken as equal."""
+WITHIN = 0.75
+"""Share of the faster table's period by which the readings of a sample may be apart: half, and jitter."""
 SLOWER = 1.1
 """Factor of its period by which the second table is slower than the first, so that its samples are kept."""
 
@@ -112,7 +115,7 @@ class JoinedTables(NamedTuple):
         return [
             f'{self.second}: its clock shows {abs(o.seconds):.5f} s {way} than that of {self.first}, {found}',
             f'each sample is a reading of both, {1e3 * self.apart:.3f} ms apart (rms); {self.lost} are lost, without a '
-            'reading of the other within half a period',
+            'reading of the other that is near',
         ]
 
     def tree(self) -> dict[str, object]:
@@ -141,7 +144,7 @@ def join(first: str | Path, second: str | Path, offset: float | None = None) -> 
     theirs = theirs._replace(t=clock.on_first(theirs.t))
     slower = theirs if theirs.period > SLOWER * ours.period else ours
     other = ours if slower is theirs else theirs
-    at, of = _pairs(slower.t, other.t, 0.5 * other.period)
+    at, of = _pairs(slower.t, other.t, WITHIN * other.period)
     if not len(at):
         raise RecordingError(f'{second}: no reading is at the time of one of {first}: their clocks are further apart')
     t_ns = np.rint(1e9 * slower.t[at]).astype(np.int64) if slower is theirs else slower.t_ns[at]
@@ -161,14 +164,17 @@ def join(first: str | Path, second: str | Path, offset: float | None = None) -> 
 
 
 def _pairs(t: FloatArray, others: FloatArray, within: float) -> tuple[IntArray, IntArray]:
-    """Which of ``t`` (n,) has which of ``others`` (m,) as its nearest, ``within`` s, none of them twice."""
+    """Which of ``t`` (n,) has which of ``others`` (m,): the nearest behind the last one taken, ``within`` s of it."""
     after = np.clip(np.searchsorted(others, t), 1, len(others) - 1)
     nearest = after - (t - others[after - 1] <= others[after] - t)
-    apart = np.abs(t - others[nearest])
-    order = np.lexsort((apart, nearest))
-    best = order[np.concatenate(([True], np.diff(nearest[order]) > 0))]
-    at = np.sort(best[apart[best] <= within])
-    return at, nearest[at]
+    last, taken = -1, []
+    for i, (time, j) in enumerate(zip(t.tolist(), nearest.tolist(), strict=True)):
+        j = max(j, last + 1)
+        if j < len(others) and abs(others[j] - time) <= within:
+            taken.append((i, j))
+            last = j
+    at, of = np.array(taken, np.int64).reshape(-1, 2).T
+    return at, of
 
 
 def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: str | Path) -> ClockOffset:
@@ -188,7 +194,8 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
     unknown = ''
     for begin in np.arange(ours.t[0], ours.t[-1], STRETCH_S).tolist():
         end = min(begin + STRETCH_S, float(ours.t[-1]))
-        tried = [(start, shift(begin, end, start, STRETCH_S)) for start in starts]
+        # The smaller the reach, the more of the motion is compared.
+        tried = [(start, shift(begin, end, start, reach)) for start in starts for reach in REACHES_S]
         sure = [f._replace(seconds=start + f.seconds) for start, f in tried if not f.unknown]
         sure.sort(key=lambda f: f.unshared)
         if sure and (sure[-1].unshared > CLEARLY * sure[0].unshared or np.ptp([f.seconds for f in sure]) < NEAR_S):
