@@ -23,8 +23,8 @@ from psd_deflection.records import FloatArray, IntArray, RawChunk, channel_names
 STRETCH_S, REACHES_S = 60.0, (2.0, 5.0, 20.0)
 """The motion of so long a part tells the time between the clocks, s: beside the starts, up to one of these, and a third
 of the part."""
-PIECE_S, MOST_PIECES = 10.0, 16
-"""Pieces of at least this length, at most so many, tell the difference of the clocks' rates."""
+PIECE_S, MOST_PIECES, TURNS = 10.0, 16, 3
+"""Pieces of at least this length, at most so many, tell the difference of the clocks' rates, in so many turns."""
 NEAR_S = 0.2
 """Shifts within which a found one is looked for again, s."""
 CLEARLY = 4.0
@@ -52,6 +52,10 @@ class ClockOffset(NamedTuple):
     rate: float = 0.0
     rate_sd: float = math.inf
     given: bool = False
+
+    def on_second(self, t: FloatArray) -> FloatArray:
+        """Times of the second clock, s, at times ``t`` of the first."""
+        return t + self.seconds + self.rate * (t - self.at)
 
     def on_first(self, t: FloatArray) -> FloatArray:
         """Times of the first clock, s, at times ``t`` of the second."""
@@ -179,24 +183,13 @@ def _pairs(t: FloatArray, others: FloatArray, within: float) -> tuple[IntArray, 
 
 def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: str | Path) -> ClockOffset:
     # Clocks that count from one beginning show the same, nearly; else the loggers were started together, nearly.
-    starts = (0.0, float(theirs.t[0] - ours.t[0]))
-    period = min(ours.period, theirs.period)
-
-    def shift(begin: float, end: float, about: float, reach: float) -> TimeShift:
-        grid = np.arange(begin, end, period)
-        found = time_shift(ours.at(grid), theirs.at(grid + about), period, reach)
-        if found.unknown or reach < NEAR_S:
-            return found
-        # What is left is no part of a sample, which the interpolation would bias.
-        near = shift(begin, end, about + found.seconds, 0.99 * NEAR_S)
-        return near if near.unknown else near._replace(seconds=found.seconds + near.seconds)
-
+    starts = (ClockOffset(0.0, 0.0), ClockOffset(float(theirs.t[0] - ours.t[0]), 0.0))
     unknown = ''
     for begin in np.arange(ours.t[0], ours.t[-1], STRETCH_S).tolist():
         end = min(begin + STRETCH_S, float(ours.t[-1]))
         # The smaller the reach, the more of the motion is compared.
-        tried = [(start, shift(begin, end, start, reach)) for start in starts for reach in REACHES_S]
-        sure = [f._replace(seconds=start + f.seconds) for start, f in tried if not f.unknown]
+        tried = [(start, _shift(ours, theirs, begin, end, start, reach)) for start in starts for reach in REACHES_S]
+        sure = [f._replace(seconds=start.seconds + f.seconds) for start, f in tried if not f.unknown]
         sure.sort(key=lambda f: f.unshared)
         if sure and (sure[-1].unshared > CLEARLY * sure[0].unshared or np.ptp([f.seconds for f in sure]) < NEAR_S):
             break
@@ -206,23 +199,41 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
             f'{first}, {second}: {unknown}: this does not tell how far the two clocks are apart. Push the link a few '
             'times, irregularly, while both record; or say what the second clock shows more: --offset SECONDS'
         )
-    known = ClockOffset(sure[0].seconds, sure[0].sd, 0.5 * (begin + end))
+    clock = ClockOffset(sure[0].seconds, sure[0].sd, 0.5 * (begin + end))
     edges = np.linspace(ours.t[0], ours.t[-1], min(MOST_PIECES, int(np.ptp(ours.t) / PIECE_S)) + 1)
-    at, seconds, sd = [], [], []
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        middle = 0.5 * (begin + end)
-        piece = shift(begin, end, known.seconds, NEAR_S + DRIFT * abs(middle - known.at))
-        if not piece.unknown:
-            at.append(middle)
-            seconds.append(known.seconds + piece.seconds)
-            sd.append(piece.sd)
-    return known if len(at) < 2 else _line(np.array(at), np.array(seconds), np.array(sd))
+    for _ in range(TURNS):
+        found = []
+        for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            middle = 0.5 * (begin + end)
+            piece = _shift(ours, theirs, begin, end, clock, NEAR_S + DRIFT * abs(middle - clock.at))
+            if not piece.unknown:
+                found.append((middle, piece.seconds, piece.sd))
+        if len(found) < 2:
+            break
+        # The pushes in a piece are not in its middle: only what is left of a rate is found without a bias.
+        clock = _along(clock, *np.array(found).T)
+    return clock
 
 
-def _line(at: FloatArray, seconds: FloatArray, sd: FloatArray) -> ClockOffset:
-    """The offset whose course is a straight line, or constant if that is as likely."""
+def _shift(
+    ours: LoggerTable, theirs: LoggerTable, begin: float, end: float, clock: ClockOffset, reach: float
+) -> TimeShift:
+    """What the second clock shows more than ``clock`` says, from the motion from ``begin`` to ``end`` of the first."""
+    grid = np.arange(begin, end, min(ours.period, theirs.period))
+    found = time_shift(ours.at(grid), theirs.at(clock.on_second(grid)), float(grid[1] - grid[0]), reach)
+    if found.unknown or reach < NEAR_S:
+        return found
+    # What is left is no part of a sample, which the interpolation would bias.
+    nearer = clock._replace(seconds=clock.seconds + found.seconds)
+    near = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S)
+    return near if near.unknown else near._replace(seconds=found.seconds + near.seconds)
+
+
+def _along(clock: ClockOffset, at: FloatArray, more: FloatArray, sd: FloatArray) -> ClockOffset:
+    """``clock`` with what it shows ``more`` at some times, as a straight line, or constant if that is as likely."""
     weights = sd**-2.0
     middle = float(weights @ at / weights.sum())
+    seconds = clock.seconds + clock.rate * (at - clock.at) + more
     for rates in (1, 0):
         design = np.column_stack((np.ones(len(at)), at - middle))[:, : 1 + rates]
         covariance = np.linalg.inv(design.T @ (weights[:, None] * design))

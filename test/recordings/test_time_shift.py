@@ -3,7 +3,6 @@
 """The time between two PSDs from their motion alone, and two loggers' tables joined by it."""
 
 import json
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.read.csv_reader import CsvRecording
 from psd_deflection.recordings.time_shift import AT_REST, REPEATS, TimeShift, time_shift
-from psd_deflection.recordings.two_loggers import JoinedTables, join
-from psd_deflection.records import FloatArray
+from psd_deflection.recordings.two_loggers import join
+from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import load_rig
 
 STEPS = 'steps:0,0,0;0,-10,0;0,-10,-5.85;0,0,0;12,0,0;0,0,4;0,0,0;0,-20,-11.7;0,0,0:2'
@@ -29,11 +28,19 @@ AXES = {
 }
 
 
+PUSHES = (
+    'steps:0,0,0;3,-10,0:1.3',
+    'steps:0,0,0;0,6,-2:2.1',
+    'steps:0,0,0;12,0,1;0,-4,2:1.7',
+    'steps:0,0,0;5,5,0;-6,2,1;0,0,0:2.9',
+)
+
+
 @cache
-def volts(words: str = STEPS) -> FloatArray:
+def volts(*words: str) -> FloatArray:
     """(n, 6), V, at 1 kHz."""
     rig = load_rig()
-    counts = RigSimulator(rig, 3).step(loads.load_histories([words], 1000.0).loads).counts
+    counts = RigSimulator(rig, 3).step(loads.load_histories(words, 1000.0).loads).counts
     return counts * rig.converter.volts_per_count
 
 
@@ -48,16 +55,16 @@ def shift_of(table: FloatArray, rows: int = 0, axes: str = 'as named', stated: f
 @pytest.mark.parametrize('rows', [0, 1, 8, 40, 1000, 3000])
 def test_the_shift_is_found_of_either_sign(rows: int, axes: str) -> None:
     for k in (rows, -rows):
-        found = shift_of(volts(), k, axes)
+        found = shift_of(volts(STEPS), k, axes)
         assert not found.unknown
         assert found.sd < 3e-5
         assert abs(found.seconds - 1e-3 * k) < 3.0 * found.sd
         assert (found.evidence > 0.0) == (k != 0)
-        assert shift_of(volts(), k, axes, stated=1e-3 * k).evidence == 0.0
+        assert shift_of(volts(STEPS), k, axes, stated=1e-3 * k).evidence == 0.0
 
 
 def test_lost_samples_and_spikes_leave_the_shift() -> None:
-    table = volts().copy()
+    table = volts(STEPS).copy()
     rng = np.random.default_rng(0)
     table[rng.random(len(table)) < 0.1] = np.nan
     table[6000:7000, 3:] = np.nan
@@ -74,7 +81,7 @@ def test_lost_samples_and_spikes_leave_the_shift() -> None:
         ('constant:0,-10,-5.85:20', 'as named', AT_REST),
         (STEPS, 'dead', AT_REST),
         ('steps:0,0,0;0,-10,0;0,0,0;0,-10,0;0,0,0;0,-10,0;0,0,0;0,-10,0;0,0,0:1', 'as named', REPEATS),
-        ('chirp:0,5,0,1.3,1.3:20', 'as named', REPEATS),
+        ('chirp:0,5,0:1.3,1.3:20', 'as named', REPEATS),
     ],
 )
 def test_motion_that_does_not_tell_gives_a_reason(words: str, axes: str, why: str) -> None:
@@ -82,48 +89,71 @@ def test_motion_that_does_not_tell_gives_a_reason(words: str, axes: str, why: st
         assert shift_of(volts(words), rows, axes).unknown == why
 
 
-def written(path: Path, rows: Sequence[int], columns: slice, names: str, clock: float = 0.0, rate: float = 1.0) -> Path:
-    """The table of a logger that reads ``columns`` at ``rows``, by a clock that shows ``clock`` then more."""
-    lines = [f't,{names}', *(f'{clock + 1e-3 * k * rate:.6f},' + ','.join(map(str, volts()[k, columns])) for k in rows)]
-    path.write_text('\n'.join(lines) + '\n')
+def write_table(path: Path, t: FloatArray, rows: IntArray, psd: int) -> Path:
+    """What a logger of one PSD writes: its readings at ``rows``, at the times ``t`` of its clock."""
+    table = volts(*PUSHES)[rows, 3 * psd - 3 : 3 * psd]
+    lines = (f'{when:.6f},{x},{y},{light}' for when, (x, y, light) in zip(t.tolist(), table.tolist(), strict=True))
+    path.write_text('\n'.join((f't,x{psd},y{psd},sum{psd}', *lines)) + '\n')
     return path
 
 
-def loggers(
-    folder: Path, *, every: int = 10, late: int = 1730, clock: float = 0.0, rate: float = 1.0
-) -> tuple[Path, Path]:
-    """The first begins at once, the second ``late`` ms later, each with 10 ms and some jitter between readings."""
+def loggers(folder: Path, every: int, offset: float, rate: float = 0.0) -> tuple[Path, Path]:
+    """Tables of PSD 1, every 10 ms, and PSD 2, begun 1.73 s later, every so many ms by a clock that shows more."""
     rng = np.random.default_rng(1)
-    first = np.arange(5, 18000, 10) + rng.integers(-1, 2, 1800)
-    second = np.arange(late, 18000, every)
-    second = second + rng.integers(-1, 2, len(second)) * (every > 2)
-    names = ('x1,y1,sum1', 'x2,y2,sum2')
-    return (
-        written(folder / 'a.csv', first.tolist(), slice(0, 3), names[0]),
-        written(folder / 'b.csv', second.tolist(), slice(3, 6), names[1], clock - 1e-3 * late, rate),
-    )
+    rows = [np.arange(first, len(volts(*PUSHES)) - 2, step) for first, step in ((5, 10), (1730, every))]
+    rows = [r + rng.integers(-1, 2, len(r)) * (every > 2) for r in rows]
+    clocks = (1e-3 * rows[0], offset + 1e-3 * (1.0 + rate) * rows[1])
+    first, second = (write_table(folder / f'{k}.csv', clocks[k - 1], rows[k - 1], k) for k in (1, 2))
+    return first, second
 
 
-def readings(joined: JoinedTables) -> FloatArray:
-    """(n, 7): the time on the first clock, s, and the volts."""
-    (chunk,) = joined.recording._chunks()  # noqa: SLF001 - all at once
-    return np.column_stack((1e-9 * chunk.t_ns, chunk.readings))
+@pytest.mark.parametrize(('every', 'offset'), [(10, -1.73), (10, 7.3), (20, 0.0), (2, 1.7e9)])
+def test_each_joined_sample_is_a_reading_of_both_loggers(tmp_path: Path, every: int, offset: float) -> None:
+    tables = loggers(tmp_path, every, offset)
+    joined = join(*tables)
+    assert abs(joined.offset.seconds - offset) < 4.0 * joined.offset.sd < 2e-3
+    found = joined.recording.samples
+    read = [CsvRecording(path, part=True) for path in tables]
+    inside = [np.concatenate([b.t_ns for b in r.blocks()]) * 1e-9 - k * offset for k, r in enumerate(read)]
+    overlap = inside[every > 10][inside[every > 10] > 1.735]
+    assert abs(len(found) + joined.lost - len(overlap)) <= 1
+    assert joined.lost < 0.01 * len(found)
+    for names, recording in ((('x1', 'y1', 'sum1'), read[0]), (('x2', 'y2', 'sum2'), read[1])):
+        rows = {tuple(row) for b in recording.blocks() for row in b.volts.tolist()}
+        assert {tuple(row) for row in np.array(found[list(names)].tolist(), np.float32).tolist()} <= rows
 
 
-@pytest.mark.parametrize(('every', 'clock'), [(10, 0.0), (10, 7.3), (25, 0.0), (2, 1.7e9)])
-def test_two_loggers_become_one_without_an_invented_sample(tmp_path: Path, every: int, clock: float) -> None:
-    first, second = loggers(tmp_path, every=every, clock=1.73 + clock)
-    joined = join(first, second)
-    assert abs(joined.offset.seconds - clock) < 4.0 * joined.offset.sd < 2e-3
-    found, ours, theirs = readings(joined), *(CsvRecording(p, part=True).samples for p in (first, second))
-    assert len(found) + joined.lost == len(theirs if every > 10 else ours[ours['t_ns'] >= 1e9 * found[0, 0]])
-    # Each is a reading of both tables, none is there twice.
-    for table, columns in ((ours, slice(1, 4)), (theirs, slice(4, 7))):
-        rows = {tuple(row) for row in np.array(table[['x1', 'y1', 'sum1']].tolist(), np.float32).tolist()}
-        assert {tuple(row) for row in found[:, columns].astype(np.float32).tolist()} <= rows
-
-
-def test_clocks_of_different_rates_are_told_and_put_right(tmp_path: Path) -> None:
-    first, second = loggers(tmp_path, every=2, clock=1.73, rate=1.0 + 4e-4)
-    offset = join(first, second).offset
+def test_clocks_of_different_rates_are_put_right(tmp_path: Path) -> None:
+    offset = join(*loggers(tmp_path, 2, 0.0, rate=4e-4)).offset
+    assert offset.rate > 0.0
     assert abs(offset.rate - 4e-4) < 4.0 * offset.rate_sd < 1e-4
+
+
+def test_convert_joins_two_loggers_and_says_how(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = map(str, loggers(tmp_path, 10, -1.73))
+    assert main(['convert', first, second, '--out', str(tmp_path / 'run.csv')]) == 0
+    said = capsys.readouterr().out
+    assert '2.csv: its clock shows 1.7' in said
+    assert 'less than that of' in said
+    assert main(['convert', first, second, '--offset', '-1.73', '--out', str(tmp_path / 'bag'), '--json']) == 0
+    clocks = json.loads(capsys.readouterr().out)['clocks']
+    assert (clocks['given'], clocks['offset'], clocks['rate_sd']) == (True, -1.73, None)
+
+
+def test_two_loggers_that_cannot_be_joined_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = loggers(tmp_path, 10, 0.0)
+    rest = np.arange(3000)
+    still = write_table(tmp_path / 'still.csv', 1e-2 * rest, rest % 2, 2)
+    with pytest.raises(RecordingError, match=f'{AT_REST}.*irregularly.*--offset'):
+        join(first, still)
+    with pytest.raises(RecordingError, match='have x, y and sum of each PSD once'):
+        join(first, first)
+    with pytest.raises(RecordingError, match='clocks are further apart'):
+        join(first, second, 1000.0)
+    for words, why in (
+        ((str(first), '--offset', '1'), '--offset is for the .csv of two loggers'),
+        ((str(first), str(second), str(first)), 'one recording is converted'),
+        ((str(first),), 'joins the parts of two loggers'),
+    ):
+        assert main(['convert', *words, '--out', str(tmp_path / 'out.csv')]) in (2, 4)
+        assert why in capsys.readouterr().err
