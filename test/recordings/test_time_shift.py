@@ -107,6 +107,7 @@ def loggers(folder: Path, every: int, offset: float, rate: float = 0.0) -> tuple
     return first, second
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('every', 'offset'), [(10, -1.73), (10, 7.3), (20, 0.0), (2, 1.7e9)])
 def test_each_joined_sample_is_a_reading_of_both_loggers(tmp_path: Path, every: int, offset: float) -> None:
     tables = loggers(tmp_path, every, offset)
@@ -123,6 +124,7 @@ def test_each_joined_sample_is_a_reading_of_both_loggers(tmp_path: Path, every: 
         assert {tuple(row) for row in np.array(found[list(names)].tolist(), np.float32).tolist()} <= rows
 
 
+@pytest.mark.slow
 def test_clocks_of_different_rates_are_put_right(tmp_path: Path) -> None:
     offset = join(*loggers(tmp_path, 2, 0.0, rate=4e-4)).offset
     assert offset.rate > 0.0

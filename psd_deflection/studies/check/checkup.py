@@ -168,8 +168,8 @@ _LOADS = tuple(ALONE)
 class CheckProblem:
     """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``,
     ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``source``: the recording, '' at
-    the bench. ``notes``: PSDs that are late, then loads that hung at another time than noted, that swayed, that were
-    others, or that were not noted.
+    the bench. ``notes``: of loads that hung at another time than noted, that swayed, that were others, or that were
+    not noted. ``late``: PSDs that are on another clock.
     """
 
     rig: Rig
@@ -178,7 +178,8 @@ class CheckProblem:
     drift: FloatArray
     drift_sd: FloatArray
     source: str = ''
-    notes: Sequence[LatePsd | LoadNote] = ()
+    notes: Sequence[LoadNote] = ()
+    late: Sequence[LatePsd] = ()
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
@@ -198,8 +199,10 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     effective = effective_loads(rig, wiring.to_psds(moved), loads)
     moved = np.where(np.isfinite(effective.volts).any(axis=1, keepdims=True), moved, np.nan)
     answered = responses(rig, moved, effective.loads)
-    notes = (*apart, *late, *effective.notes)
-    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, notes)
+    notes = (*late, *effective.notes)
+    return CheckProblem(
+        rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, notes, apart
+    )
 
 
 def check(problem: CheckProblem) -> Checkup:
@@ -223,7 +226,7 @@ def check(problem: CheckProblem) -> Checkup:
     if not determined and not dead:
         findings += _coverage(pushes, observed, wirings)
     # Pushes that are not there yet are no mistake.
-    wrong = light or problem.notes or any(f.name != 'load_coverage' for f in findings)
+    wrong = light or problem.late or problem.notes or any(f.name != 'load_coverage' for f in findings)
     verdict = WRONG if wrong else RIGHT if determined else CANNOT_TELL
     sizes = tuple(p.misfit(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(
@@ -238,6 +241,7 @@ def check(problem: CheckProblem) -> Checkup:
         drift=problem.drift,
         drift_sd=problem.drift_sd,
         light=light,
+        late=tuple(problem.late),
         notes=tuple(_notes(problem, best.wiring, sizes)),
         source=problem.source,
     )

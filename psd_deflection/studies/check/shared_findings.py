@@ -13,7 +13,6 @@ from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
-from psd_deflection.studies.loads.alignment import LatePsd
 from psd_deflection.studies.loads.effective import LoadNote
 
 NOISE_FACTOR = 2.0
@@ -103,9 +102,9 @@ def _far(factor: float) -> bool:
     return factor > 0.0 and not 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR
 
 
-def note_finding(note: LatePsd | LoadNote, name: str) -> Finding:
-    """A PSD that is late, or a load that was noted at another time or as another one than it hung, swayed, or was not
-    noted, of the recording ``name``.
+def note_finding(note: LoadNote, name: str) -> Finding:
+    """A load that was noted at another time or as another one than it hung, swayed, or was not noted, of the recording
+    ``name``.
     """
     return Finding(note.name, note.where, note.value, note.words(name), note.size)
 

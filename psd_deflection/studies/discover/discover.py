@@ -15,13 +15,11 @@ import numpy as np
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.check.shared_findings import noise_findings, note_finding, step_findings
+from psd_deflection.studies.check.shared_findings import noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.applied import (
     directions,
@@ -332,6 +330,7 @@ def discover(
         setup=problem.setup,
         values=problem.values,
         known=machine.recorded.stated,
+        late=tuple(late.words(machine.recorded.observations[0].name) for late in machine.recorded.late),
         law=problem.law if problem.unknown else None,
         alternative_fits=problem.alternative_fits,
         unsettled=problem.unsettled,
@@ -379,8 +378,7 @@ def set_up(problem: Problem) -> Problem:
             values |= lines
     setup += wrong_load_findings(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
-    clocks, named = _clocks(machine.recorded, named)
-    setup = [*clocks, *setup]
+    named = _clocks(machine.recorded, named)
     if machine.recorded.value_grid is not None and not machine.recorded.value_grid_stated:
         value_grid = machine.recorded.value_grid
         named.append(_named_value_grid(ws, value_grid))
@@ -400,26 +398,18 @@ def set_up(problem: Problem) -> Problem:
     )
 
 
-def _clocks(recorded: Recorded, named: list[NamedEffect]) -> tuple[list[Finding], list[NamedEffect]]:
-    """Return what was said of PSDs on another clock: findings, or, where a simulation can do it, effects before others.
-
-    ``named``: among these what the search has found beside whole samples.
-    """
-    findings, effects = list[Finding](), list[NamedEffect]()
-    apart = [(o, late) for o, listed in zip(recorded.observations, recorded.late, strict=False) for late in listed]
+def _clocks(recorded: Recorded, named: Sequence[NamedEffect]) -> list[NamedEffect]:
+    """Return ``named``, which the search found beside readings moved by whole samples, with the PSDs that are late."""
     beside = {n.active.values['psd']: n for n in named if n.name == SKEW}
-    alike = len(apart) == len({(late.psd, late.rows) for _, late in apart}) * len(recorded.observations)
-    for o, late in apart:
-        more = beside.get(late.psd)
-        value = late.value if more is None else late.rows * o.period + more.active.values['delay']
-        least, most = catalogue()[SKEW].parameter('delay').bounds(Physics.of(o.rig), {})
-        if not alike or SKEW in recorded.without or not least <= value <= most:
-            findings.append(note_finding(replace(late, value=value), o.name))
-        elif o is recorded.observations[0]:
-            active = ActiveEffect(catalogue()[SKEW], {'psd': float(late.psd), 'delay': value})
-            effects.append(_named_by_readings(active, {'delay': late.sd} if more is None else more.sd, 0.5 * late.size))
-    moved = {late.psd for _, late in apart}
-    return findings, [*effects, *(n for n in named if n.name != SKEW or n.active.values['psd'] not in moved)]
+    period = recorded.observations[0].period
+    effects = []
+    for late in recorded.late:
+        more = beside.pop(late.psd, None)
+        delay = late.seconds if more is None else late.rows * period + more.active.values['delay']
+        active = ActiveEffect(catalogue()[SKEW], {'psd': float(late.psd), 'delay': delay})
+        sd = {'delay': late.sd} if more is None else more.sd
+        effects.append(_named_by_readings(active, sd, 0.5 * late.evidence))
+    return [*effects, *(n for n in named if n.name != SKEW or n.active.values['psd'] in beside)]
 
 
 def noise_level(problem: Problem) -> Problem:

@@ -4,7 +4,7 @@
 anything else is judged."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.steps import link_motion
 
 SKEW = 'channel_skew'
-"""The effect of the catalogue that makes one PSD late, and the finding."""
+"""The effect of the catalogue that makes one PSD late."""
 REACH_S = 4.0
 """Longest time between two PSDs that is looked for, and a little more, s."""
 SURE = 3.0
@@ -24,22 +24,17 @@ SURE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class LatePsd:
-    """``psd`` (from 1) is ``value`` s later than PSD ``reference``, beside what the rig file says; ``sd``: s.
+    """``psd`` (from 1) is ``seconds`` later than PSD ``reference``, beside what the rig file says; ``sd``: s.
 
-    ``rows``: by so many samples its readings were moved. ``size``: twice the log-likelihood ratio for it.
+    ``rows``: by so many samples its readings were moved. ``evidence``: twice the log-likelihood ratio for it.
     """
 
     psd: int
     reference: int
-    value: float
+    seconds: float
     sd: float
     rows: int
-    size: float
-
-    @property
-    def name(self) -> str:
-        """Of the finding, and of the effect that does the same."""
-        return SKEW
+    evidence: float
 
     @property
     def where(self) -> str:
@@ -48,13 +43,17 @@ class LatePsd:
 
     def words(self, name: str) -> str:
         """What is wrong, and what to do; ``name``: of the recording."""
-        n, direction = self.psd, 'later' if self.value > 0.0 else 'earlier'
+        n, direction = self.psd, 'later' if self.seconds > 0.0 else 'earlier'
         way = 'up' if self.rows > 0 else 'down'
         return (
-            f"PSD {n}'s readings in {name} are {in_ms(self.value, self.sd)} {direction} than PSD {self.reference}'s: "
+            f"PSD {n}'s readings in {name} are {in_ms(self.seconds, self.sd)} {direction} than PSD {self.reference}'s: "
             f'two clocks, or a logger that holds one back. Sample both at once, or move the columns '
             f'x{n}, y{n}, sum{n} {abs(self.rows)} rows {way}; the rest is judged with them moved'
         )
+
+    def tree(self) -> dict[str, object]:
+        """As JSON has it."""
+        return asdict(self)
 
 
 def in_ms(value: float, sd: float) -> str:
