@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.devices.serve import served_loads
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation import loads, simulator
-from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.catalogue import make_active, with_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
@@ -169,6 +169,25 @@ def test_a_delay_is_exact_just_after_a_load_step_too(delay: float) -> None:
     found = effect_volts(make_active('channel_skew', {'psd': 2, 'delay': delay}, 'test'))
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10)
     assert np.abs(expected - fine[:, :-1:FINER]).max() > 1e-2
+
+
+@pytest.mark.parametrize('delay', [-0.4e-3, -3.7e-3])
+def test_an_early_psd_reads_what_is_still_to_come(delay: float) -> None:
+    early, fine = round(-delay * 1e3 * FINER), fine_volts()
+    expected = fine[:, :-1:FINER].copy()
+    ahead = fine[3:, early:-1:FINER]
+    found = effect_volts(make_active('channel_skew', {'psd': 2, 'delay': delay}, 'test'))
+    np.testing.assert_allclose(found[:3], expected[:3], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(found[3:, : ahead.shape[1]], ahead, rtol=0.0, atol=1e-10)
+    assert np.abs(expected[3:, : ahead.shape[1]] - ahead).max() > 1e-2
+
+
+def test_a_running_rig_has_no_early_psd() -> None:
+    rig = with_effects(load_rig(), ['channel_skew,psd=2,delay=-0.0015'], 'test')
+    simulator, history = RigSimulator(rig), loads.constant((0.0, -5.0, 1.0), 0.05).loads
+    assert simulator.step(history).counts.shape == (50, 6)
+    with pytest.raises(ConfigError, match='a PSD that is early is simulated with all loads at once'):
+        simulator.step(history)
 
 
 def lagged(fine: FloatArray, tau: float) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig, make_active, with_effects
@@ -582,23 +582,19 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(('psd', 'rows', 'beside'), [(2, 8, 0.0003), (2, -8, 0.0003), (1, 40, 0.0), (2, -1000, 0.0)])
 def test_a_psd_on_another_clock_is_named_late_or_early(psd: int, rows: int, beside: float) -> None:
-    """Late it is an effect, which a simulation can do; early a mistake of the recording. Nothing else is named."""
     rig = with_effects(RIG, [f'channel_skew,psd={psd},delay={beside}'] if beside else [], 'test')
     o, late, n = observe(rig, 5), slice(3 * psd - 3, 3 * psd), len(HISTORY.loads) - abs(rows)
     volts = o.volts[max(rows, 0) :][:n].copy()
     volts[:, late] = o.volts[max(-rows, 0) :][:n, late]
-    found = found_in(Observation('test', RIG, volts, o.loads[max(rows, 0) :][:n]))
-    delay = 1e-3 * rows + beside
-    if rows > 0:
-        (effect,) = found.effects
-        assert (effect.name, effect.values['psd'], found.setup) == ('channel_skew', psd, ())
-        assert effect.values['delay'] == pytest.approx(delay, abs=4.0 * effect.sd['delay'])
-    else:
-        (mistake,) = found.setup
-        assert (found.verdict, mistake.name, mistake.where) == ('nothing_missing', 'channel_skew', f'psd_{psd}')
-        assert mistake.value == pytest.approx(delay, abs=6e-5)
-        assert f'channel skew (psd_{psd}, {abs(delay):.3g} s early)' in found.sentence
+    recorded = Observation('test', RIG, volts, o.loads[max(rows, 0) :][:n])
+    found = found_in(recorded)
+    (effect,) = found.effects
+    assert (effect.name, effect.values['psd'], found.setup) == ('channel_skew', psd, ())
+    assert effect.values['delay'] == pytest.approx(1e-3 * rows + beside, abs=4.0 * effect.sd['delay'])
+    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in found.lines()[1]
     assert found.floors < 1.05
+    with pytest.raises(RecordingError, match='the clocks are not alike'):
+        found_in(recorded, o)
 
 
 def test_a_jump_is_found_at_its_sample() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from psd_deflection.measure import steps as found_steps
 from psd_deflection.measure.steps import DotStep, last_load_change
+from psd_deflection.model.simulation.catalogue import with_effects
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
@@ -20,6 +21,7 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
+from psd_deflection.studies.loads.alignment import aligned
 from psd_deflection.studies.loads.annotated_times import (
     ALIKE_S,
     CorrectedLoads,
@@ -114,6 +116,23 @@ def test_slow_loads_noted_as_steps_are_ramps() -> None:
     assert {n.name for n in found.notes} == {'load_ramp'}
     assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
     assert not found.unused.any()
+
+
+@pytest.mark.parametrize(('psd', 'rows'), [(1, 40), (2, 8), (2, -40)])
+def test_the_psd_that_agrees_with_the_loads_stays(psd: int, rows: int) -> None:
+    late, n = slice(3 * psd - 3, 3 * psd), COUNT - abs(rows)
+    read, loads = QUIET[max(rows, 0) :][:n].copy(), applied()[max(rows, 0) :][:n]
+    in_time = read.copy()
+    read[:, late] = QUIET[max(-rows, 0) :][:n, late]
+    moved, (found,) = aligned(RIG, read, loads)
+    assert (found.psd, found.rows, found.reference) == (psd, rows, 3 - psd)
+    there = np.isfinite(moved).all(axis=1)
+    assert np.count_nonzero(~there) == abs(rows)
+    np.testing.assert_array_equal(moved[there], in_time[there])
+    # What the rig file says of it is nothing new, and what is right stays.
+    known = with_effects(RIG, [f'channel_skew,psd={psd},delay={1e-3 * rows}'], 'test')
+    for rig, volts in ((known, read), (RIG, in_time)):
+        assert aligned(rig, volts, loads) == (volts, ())
 
 
 def test_other_natural_frequencies_change_no_time() -> None:
