@@ -56,7 +56,7 @@ def time_shift(first: FloatArray, second: FloatArray, period: float, reach: floa
     """Return by how much ``second`` (n, q) is later than ``first`` (n, p): rows ``period`` s apart, NaN if lost.
 
     ``reach``: the largest shift of either sign, s; of a short recording a third of its length. ``stated``: what the
-    shift is said to be, s.
+    shift is expected to be, s.
     """
     finer = int(np.ceil(0.99 * period / STEP_S))
     first, second, period = _between(first, finer), _between(second, finer), period / finer
@@ -102,8 +102,8 @@ def time_shift(first: FloatArray, second: FloatArray, period: float, reach: floa
     curvature = max(before - 2.0 * here + after, 1e-9)
     shift = float(near[at]) + 0.5 * (before - after) / curvature
     sd = float(np.hypot(np.sqrt(2.0 / curvature), INTERPOLATION * finer))
-    said = min(max(round(stated / period), -most * step), most * step)
-    against = float(evidence(_shares(*_sums(*pair(said))))[0])
+    expected = min(max(round(stated / period), -most * step), most * step)
+    against = float(evidence(_shares(*_sums(*pair(expected))))[0])
     return TimeShift(float(shift * period), sd * period, float(fine[at, 0]), against if against >= EVIDENCE else 0.0)
 
 
@@ -117,9 +117,14 @@ def _between(x: FloatArray, finer: int) -> FloatArray:
     return np.asarray((1.0 - share) * x[before] + share * x[before + 1])
 
 
+def _present(x: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which rows of ``x`` (n, k) are not lost, (n,)."""
+    return np.asarray(np.isfinite(x).all(axis=1))
+
+
 def _movements(x: FloatArray, width: int) -> FloatArray:
     """The mean of ``width`` rows minus that of the ``width`` rows before, (n - 2 width + 1, k); NaN if half is lost."""
-    there = np.isfinite(x).all(axis=1)
+    there = _present(x)
     known = np.where(there[:, None], x, 0.0)
     known = np.where(there[:, None], x - known.sum(axis=0) / max(int(there.sum()), 1), 0.0)
     sums = np.cumsum(np.vstack((np.zeros(x.shape[1]), known)), axis=0)
@@ -131,7 +136,7 @@ def _movements(x: FloatArray, width: int) -> FloatArray:
 
 def _sums(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sums of products of ``a`` (n, p) with itself, ``b`` (n, q) with itself, and the two, over the rows of both."""
-    both = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    both = _present(a) & _present(b)
     a, b = a[both], b[both]
     return (a.T @ a)[None], (b.T @ b)[None], (a.T @ b)[None]
 
@@ -145,7 +150,7 @@ def _sums_of_shifts(a: FloatArray, b: FloatArray, most: int) -> tuple[FloatArray
 
     def products(x: FloatArray) -> FloatArray:
         """1, the columns and their products (n, 1 + k + k * k), 0 in a row that is lost."""
-        there = np.isfinite(x).all(axis=1)
+        there = _present(x)
         known = np.where(there[:, None], x, 0.0)
         squares = known[:, :, None] * known[:, None, :]
         return np.column_stack((there, known, squares.reshape(len(x), -1)))
@@ -201,7 +206,7 @@ def _effective_values(a: FloatArray, b: FloatArray, memory: int) -> FloatArray:
     """Number of independent values of what each canonical pair of ``a`` and ``b`` does not share, (m,)."""
     ours, correlation, theirs = (x[0] for x in _canonical(*_sums(a, b)))
     rest = a @ ours - (b @ theirs) * correlation
-    there = np.isfinite(rest).all(axis=1)
+    there = _present(rest)
     rest = np.where(there[:, None], rest, 0.0)
     products = [(rest[k:] * rest[: len(rest) - k]).sum(axis=0) for k in range(memory + 1)]
     memories = np.array(products) / np.maximum(products[0], 1e-300)

@@ -114,9 +114,9 @@ def test_each_joined_sample_is_a_reading_of_both(tmp_path: Path, every: int, off
 def test_convert_joins_two_loggers_and_says_how(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = map(str, loggers(tmp_path, 10, -1.73))
     assert main(['convert', first, second, '--out', str(tmp_path / 'run.csv')]) == 0
-    said = capsys.readouterr().out
-    assert '2.csv: its clock shows 1.7' in said
-    assert 'less than that of' in said
+    printed = capsys.readouterr().out
+    assert '2.csv: its clock shows 1.7' in printed
+    assert 'less than that of' in printed
     assert main(['convert', first, second, '--offset', '-1.73', '--out', str(tmp_path / 'bag'), '--json']) == 0
     clocks = json.loads(capsys.readouterr().out)['clocks']
     assert (clocks['given'], clocks['offset'], clocks['rate_sd']) == (True, -1.73, None)
