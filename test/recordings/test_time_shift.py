@@ -30,7 +30,7 @@ def volts(*words: str) -> FloatArray:
     """(n, 6), V, at 1 kHz."""
     rig = load_rig()
     counts = RigSimulator(rig, 3).step(loads.load_histories(words, 1000.0).loads).counts
-    return counts * rig.converter.volts_per_count
+    return np.asarray(counts * rig.converter.volts_per_count, np.float64)
 
 
 def shift_of(table: FloatArray, rows: int, axes: IntArray = ROTATED, stated: float = 0.0) -> TimeShift:
@@ -88,9 +88,9 @@ def loggers(folder: Path, every: int, offset: float, rate: float = 0.0) -> tuple
     rng = np.random.default_rng(1)
     rows = [np.arange(first, len(volts(*PUSHES)) - 2, step) for first, step in ((5, 10), (1730, every))]
     rows = [r + rng.integers(-1, 2, len(r)) * (every > 2) for r in rows]
-    clocks = (1e-3 * rows[0], offset + 1e-3 * (1.0 + rate) * rows[1])
-    first, second = (write_table(folder / f'{k}.csv', clocks[k - 1], rows[k - 1], k) for k in (1, 2))
-    return first, second
+    first, second = (1e-3 * r.astype(np.float64) for r in rows)
+    second = offset + (1.0 + rate) * second
+    return write_table(folder / '1.csv', first, rows[0], 1), write_table(folder / '2.csv', second, rows[1], 2)
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ def test_convert_joins_two_loggers_and_says_how(tmp_path: Path, capsys: pytest.C
 def test_two_loggers_that_cannot_be_joined_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = loggers(tmp_path, 10, 0.0)
     rest = np.arange(3000)
-    still = write_table(tmp_path / 'still.csv', 1e-2 * rest, rest % 2, 2)
+    still = write_table(tmp_path / 'still.csv', np.linspace(0.0, 30.0, 3000), rest % 2, 2)
     with pytest.raises(RecordingError, match=f'{AT_REST}.*irregularly.*--offset'):
         join(first, still)
     with pytest.raises(RecordingError, match='have x, y and sum of each PSD once'):

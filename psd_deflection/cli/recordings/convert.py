@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     if len(args.recordings) == 2:
         reject(args, {'namespace': None}, 'is for a bag')
         with stage('finding the time between the clocks', quiet=args.json):
-            joined = join(*args.recordings, args.offset)
+            joined = join(args.recordings[0], args.recordings[1], args.offset)
         recording: Recording = joined.recording if args.span == FULL else joined.recording.crop(*args.span)
     else:
         reject(args, {'offset': None}, 'is for the .csv of two loggers')

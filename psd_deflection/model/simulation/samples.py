@@ -51,5 +51,8 @@ class SimulatedSamples:
 
     def first(self, n: int) -> Self:
         """The first ``n`` samples, all of whose quantities are there."""
-        rows = {f.name: v[..., :n] for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)}
-        return replace(self, **{**rows, 'noise': self.noise})
+        out = replace(self)
+        for name in (f.name for f in fields(self) if f.name != 'noise'):
+            if isinstance(rows := getattr(self, name), np.ndarray):
+                setattr(out, name, rows[..., :n])
+        return out

@@ -139,9 +139,9 @@ def test_a_psd_on_another_clock_is_told_first_and_no_wire(rows: int, psd: int) -
     loads = np.concatenate([np.zeros((2000, 3)), np.repeat([(0, -10, 0), (0, 0, 0), (12, 0, 0)], 2500, axis=0)])
     loads = np.concatenate([loads, np.repeat([(0, 0, 4), (3, 0, 0), (0, 0, 0)], 1700, axis=0)]).astype(np.float64)
     volts = recorded(loads, 1, every_turn()[1])
-    late, n = slice(3 * psd - 3, 3 * psd), len(volts) - abs(rows)
+    own, n = slice(3 * psd - 3, 3 * psd), len(volts) - abs(rows)
     moved = volts[max(rows, 0) :][:n].copy()
-    moved[:, late] = volts[max(-rows, 0) :][:n, late]
+    moved[:, own] = volts[max(-rows, 0) :][:n, own]
     found = checked(moved, loads[max(rows, 0) :][:n])
     ((late,), (wrong,)) = found.late, found.findings
     assert (found.verdict, late.where, wrong.name) == (WRONG, f'psd_{psd}', 'channel_sign')
