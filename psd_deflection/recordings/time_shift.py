@@ -59,9 +59,10 @@ def time_shift(first: FloatArray, second: FloatArray, period: float, reach: floa
     shift is expected to be, s.
     """
     finer = int(np.ceil(0.99 * period / STEP_S))
-    first, second, period = _between(first, finer), _between(second, finer), period / finer
+    rows = int(MOST_VALUES * STEP_S / period)
+    first, second, period = _between(first[:rows], finer), _between(second[:rows], finer), period / finer
     step, width = max(1, round(STEP_S / period)), max(1, round(MEAN_S / period))
-    a, b = (_movements(x, width)[: MOST_VALUES * step] for x in (first, second))
+    a, b = (_movements(x, width) for x in (first, second))
     most = min(round(reach / period / step), len(a) // step // 3)
     if most < 1 or len(a) // step < FEWEST_VALUES:
         return TimeShift(0.0, 0.0, unknown=AT_REST)

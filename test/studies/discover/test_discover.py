@@ -251,17 +251,6 @@ def test_bad_words_of_simulate_are_rejected(
 
 
 @pytest.mark.slow
-def test_a_recording_without_loads_is_rejected_with_the_way_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / 'bare.csv'
-    rows = [f'{i / 1000:.3f},0,0,5,0,0,5' for i in range(200)]
-    path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
-    assert main(['discover', str(path), '--out', str(tmp_path / 'out'), '--quiet']) == 4
-    assert 'holds no loads' in capsys.readouterr().err
-
-
-@pytest.mark.slow
 def test_a_finding_has_a_name_that_other_programs_know() -> None:
     known = SCHEMA['properties']['setup']['items']['properties']['name']['enum']
     assert set(NAMES) <= set(known)
