@@ -3,7 +3,7 @@
 """The offsets: what they reach, their limits, and when they hold."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +148,12 @@ def test_offsets_stay_within_their_limits(arm: Arm, rate: float) -> None:
         before = command.offsets
     assert np.abs(before).max() == pytest.approx(1e-3)
     assert command.limited
+
+
+def test_a_step_beyond_the_rate_alone_is_limited(arm: Arm) -> None:
+    loop = following(arm, max_rate=0.002)
+    assert loop.run(PERIOD).limited
+    assert np.abs(loop.offsets).max() < 0.1 * loop.compensator.settings.max_offset
 
 
 @pytest.mark.slow
@@ -470,21 +476,28 @@ def test_slope_is_known_0_2_s_after_joint_and_offset_rest(period: float, first: 
     assert known.index(True) == first
 
 
-def test_motion_before_first_rest_gives_no_slope() -> None:
+@pytest.mark.parametrize(
+    ('period', 'way'),
+    [(0.02, np.arange(11) / 10), (0.25, [*(0.0, 0.1) * 4, 0.0, 0.945, 1.0])],
+    ids=['long', 'last step'],
+)
+def test_motion_before_first_rest_gives_no_slope(period: float, way: Sequence[float]) -> None:
     response = JointResponse(1)
     for n in range(100):
-        moved = np.array([0.02 * min(n / 10, 1.0)])
-        response.add(0.02 * n, moved, moved, 0.01)
+        moved = np.array([0.02 * way[min(n, 10)]])
+        response.add(period * n, moved, moved, 0.01)
     assert not response.known()[0]
 
 
-@pytest.mark.parametrize(('late', 'wrong'), [(0, 1), (24, 1), (26, None)])
-def test_one_fit_is_enough_beside_a_right_joint(late: int, wrong: int | None) -> None:
-    """The second joint moves by half of its offset, ``late`` periods after the first by all of its own."""
+@pytest.mark.parametrize(
+    ('late', 'slope', 'wrong'), [(0, 0.5, 1), (24, 0.5, 1), (26, 0.5, None), (0, 4.0, 1), (0, 5.1, None)]
+)
+def test_one_fit_is_enough_beside_a_right_joint(late: int, slope: float, wrong: int | None) -> None:
+    """The second joint moves by ``slope`` of its offset, ``late`` periods after the first by all of its own."""
     response, found = JointResponse(2), []
     for n in range(130):
         offsets = 0.02 * np.clip(np.array([n - 50, n - 50 - late]) / 10, 0.0, 1.0)
-        found.append(response.add(0.02 * n, offsets * (1.0, 0.5), offsets, 0.01))
+        found.append(response.add(0.02 * n, offsets * (1.0, slope), offsets, 0.01))
     assert next((joint for joint in found if joint is not None), None) == wrong
 
 

@@ -16,7 +16,6 @@ from blind.modes import CASES, RATE, Link, driven, rung, scored
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import from_recordings
 from psd_deflection.studies.identify import modes as fitting
-from psd_deflection.studies.identify import modes as module
 from psd_deflection.studies.identify.from_recordings import read_identify
 
 SAMPLE_RATE = 1024.0
@@ -142,7 +141,7 @@ def test_a_stretch_grows_forward_and_then_back() -> None:
 @pytest.mark.parametrize(('share', 'fits'), [(0.97, 1), (1.03, 0)])
 def test_a_window_may_be_left_a_share_of_its_middle(share: float, fits: int) -> None:
     """Of the swing after three of its six periods, however quiet the noise."""
-    rest = share * module.SHARE * 1e-3 * math.exp(-0.02 * 2.0 * math.pi * 3.0)
+    rest = share * fitting.SHARE * 1e-3 * math.exp(-0.02 * 2.0 * math.pi * 3.0)
     samples = ring(times(385)) + rest * np.resize([1.0, -1.0], 385)
     assert len(fitting.scan_windows(samples, SAMPLE_RATE, [(16.0, 0.02)], 1e-9, 384, 32)) == fits
 
@@ -212,7 +211,7 @@ def test_mode_stays_if_it_saves_30_plus_4_per_stretch(monkeypatch: pytest.Monkey
             asked.append(frequency)  # noqa: B023
             return value
 
-        monkeypatch.setattr(module, 'variance_at', variance)
+        monkeypatch.setattr(fitting, 'variance_at', variance)
         fit = fitting.with_right_order(both, two, SAMPLE_RATE)
         assert len(fit.modes) == count
         assert fit.modes[-1][0] == pytest.approx(16.0, rel=1e-3)
@@ -360,9 +359,9 @@ def test_each_mode_has_its_own_scatter_and_the_loudest_is_first(monkeypatch: pyt
         asked.append(frequency)
         return 1e-4 * frequency
 
-    monkeypatch.setattr(module, 'fit_trimmed', lambda *a: ([s], fit))
-    monkeypatch.setattr(module, 'mode_sizes', lambda *a: np.array([1e-4, 1e-3]))
-    monkeypatch.setattr(module, 'variance_at', variance)
+    monkeypatch.setattr(fitting, 'fit_trimmed', lambda *a: ([s], fit))
+    monkeypatch.setattr(fitting, 'mode_sizes', lambda *a: np.array([1e-4, 1e-3]))
+    monkeypatch.setattr(fitting, 'variance_at', variance)
     found = fitting.fit_ring_downs(samples, SAMPLE_RATE, fit.modes, [s])
     assert asked == [16.0, 50.0]
     assert found.noise == pytest.approx(2e-6)

@@ -13,15 +13,6 @@ from scipy.signal.windows import hann
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import spectra
-from psd_deflection.studies.identify.spectra import (
-    ColouredNoise,
-    coloured_noise,
-    exceeds_noise,
-    loudest_peak,
-    mode_in_operation,
-    scatters_as_exponential,
-    white_noise,
-)
 
 RATE = 1000.0
 
@@ -49,17 +40,17 @@ def test_the_noise_is_that_of_the_quietest_quarter(count: int, pieces: int, quie
     samples = 1e-6 * loudness * rng.normal(size=count + 4)
     difference = np.convolve(samples, [1.0, -4.0, 6.0, -4.0, 1.0], 'valid')
     each = sorted(float(np.mean(piece**2)) for piece in np.array_split(difference, pieces))
-    assert white_noise(samples) == pytest.approx(math.sqrt(sum(each[:quiet]) / quiet / 70.0), rel=1e-9)
+    assert spectra.white_noise(samples) == pytest.approx(math.sqrt(sum(each[:quiet]) / quiet / 70.0), rel=1e-9)
 
 
 @pytest.mark.parametrize('frequency', [0.5, 1.0, 20.125, 133.625, 200.0])
 def test_a_peak_is_found_where_it_is(frequency: float) -> None:
-    assert loudest_peak(sine(frequency), RATE, 1e-9) == frequency
+    assert spectra.loudest_peak(sine(frequency), RATE, 1e-9) == frequency
 
 
 @pytest.mark.parametrize('frequency', [0.25, 0.375, 200.125, 240.0])
 def test_what_is_slower_or_faster_than_a_link_is_no_peak(frequency: float) -> None:
-    assert loudest_peak(sine(frequency), RATE, 1e-9) is None
+    assert spectra.loudest_peak(sine(frequency), RATE, 1e-9) is None
 
 
 @pytest.mark.parametrize(('frequency', 'rate'), [(20.0, RATE), (150.0, RATE), (60.0, 300.0)])
@@ -69,23 +60,23 @@ def test_a_peak_is_25_times_the_noise(frequency: float, rate: float) -> None:
     top = float(p[np.argmin(np.abs(f - frequency))])
     for factor, expected in ((24.9, None), (25.1, frequency)):
         noise = math.sqrt(top / factor / speed_of_white(1.0, frequency, rate))
-        assert loudest_peak(samples, rate, noise) == expected
+        assert spectra.loudest_peak(samples, rate, noise) == expected
 
 
 def test_a_further_peak_is_not_at_one_that_is_taken() -> None:
     """Not within 15 % of its frequency, nor within two lines of the spectrum, an eighth of a hertz each."""
-    assert loudest_peak(sine(22.875), RATE, 1e-9, [20.0]) is None
-    assert loudest_peak(sine(17.125), RATE, 1e-9, [20.0]) is None
-    assert loudest_peak(sine(23.125), RATE, 1e-9, [20.0]) == 23.125
-    assert loudest_peak(sine(16.875), RATE, 1e-9, [40.0, 20.0]) == 16.875
-    assert loudest_peak(sine(1.0), RATE, 1e-9, [0.75]) == 1.0
-    assert loudest_peak(sine(0.875), RATE, 1e-9, [0.75]) is None
+    assert spectra.loudest_peak(sine(22.875), RATE, 1e-9, [20.0]) is None
+    assert spectra.loudest_peak(sine(17.125), RATE, 1e-9, [20.0]) is None
+    assert spectra.loudest_peak(sine(23.125), RATE, 1e-9, [20.0]) == 23.125
+    assert spectra.loudest_peak(sine(16.875), RATE, 1e-9, [40.0, 20.0]) == 16.875
+    assert spectra.loudest_peak(sine(1.0), RATE, 1e-9, [0.75]) == 1.0
+    assert spectra.loudest_peak(sine(0.875), RATE, 1e-9, [0.75]) is None
 
 
 def test_the_deviation_is_the_area_under_the_density() -> None:
-    assert ColouredNoise(4.0, 0.0).deviation(100.0, RATE) == pytest.approx(40.0)
+    assert spectra.ColouredNoise(4.0, 0.0).deviation(100.0, RATE) == pytest.approx(40.0)
     area, _ = quad(lambda f: 4.0 + 5.0 / abs(1.0 - np.exp(-2j * np.pi * f / RATE)) ** 2, 50.0, 500.0)
-    assert ColouredNoise(4.0, 5.0).deviation(50.0, RATE) == pytest.approx(math.sqrt(area), rel=2e-3)
+    assert spectra.ColouredNoise(4.0, 5.0).deviation(50.0, RATE) == pytest.approx(math.sqrt(area), rel=2e-3)
 
 
 @pytest.mark.parametrize('peaks', [[14.0], [14.0, 46.0]])
@@ -97,7 +88,7 @@ def test_white_noise_below_a_link_that_is_driven_keeps_its_size(peaks: list[floa
         w = 2.0 * np.pi * peak / RATE
         pole = np.exp(-0.02 * w + 1j * w)
         samples += lfilter([2e-6], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.normal(size=20_000))
-    found = coloured_noise(samples, RATE, peaks)
+    found = spectra.coloured_noise(samples, RATE, peaks)
     density = found.density(np.array([120.0, 300.0, 450.0]), RATE)
     np.testing.assert_allclose(density, 2.0 * 2e-6**2 / RATE, rtol=0.12)
 
@@ -107,13 +98,13 @@ def test_coloured_noise_has_autoregressive_density() -> None:
     samples = sine(14.0) + lfilter([1e-6], [1.0, -0.9], rng.normal(size=20_000))
     f = np.array([60.0, 120.0, 300.0])
     expected = 2e-12 / RATE / np.abs(1.0 - 0.9 * np.exp(-2j * np.pi * f / RATE)) ** 2
-    np.testing.assert_allclose(coloured_noise(samples, RATE, [14.0]).density(f, RATE), expected, rtol=0.15)
+    np.testing.assert_allclose(spectra.coloured_noise(samples, RATE, [14.0]).density(f, RATE), expected, rtol=0.15)
 
 
 def test_band_above_fast_mode_has_no_random_walk() -> None:
     """The whole spectrum then stands for the noise."""
     samples = np.random.default_rng(9).normal(0.0, 2e-6, 20_000)
-    found = coloured_noise(samples, RATE, [185.0])
+    found = spectra.coloured_noise(samples, RATE, [185.0])
     assert found.walk == 0.0
     assert found.white == pytest.approx(2.0 * 2e-6**2 / RATE, rel=0.05)
 
@@ -126,8 +117,8 @@ def test_a_mode_exceeds_the_noise_at_its_frequency_25_times(frequency: float) ->
     for factor, expected in ((24.9, False), (25.1, True)):
         # Half of it is white, half remembers.
         half = 0.5 * top / factor / (RATE**2 * abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2)
-        noise = ColouredNoise(half, half * float(abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2))
-        assert exceeds_noise(samples, RATE, frequency, noise) is expected
+        noise = spectra.ColouredNoise(half, half * float(abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2))
+        assert spectra.exceeds_noise(samples, RATE, frequency, noise) is expected
 
 
 DRIVEN_RATE = 200.0
@@ -187,7 +178,7 @@ def test_mode_is_likeliest_with_scatter_of_likelihood(
         bounds=[(1e-3, 1e3), (13, 15), (5e-3, 0.1), (-5, 5), (1e-6, 1e3)],
     )
     best = minimize(loss, best.x, method='Nelder-Mead', options={'xatol': 1e-9, 'fatol': 1e-12, 'maxfev': 4000})
-    found = mode_in_operation(samples, DRIVEN_RATE, guess)
+    found = spectra.mode_in_operation(samples, DRIVEN_RATE, guess)
     assert found is not None
     assert found.frequency == pytest.approx(best.x[1], rel=3e-6)
     assert found.damping == pytest.approx(best.x[2], rel=3e-4)
@@ -218,7 +209,7 @@ def test_mode_is_likeliest_with_scatter_of_likelihood(
 )
 def test_mode_far_from_peak_is_not_returned(guess: float, observed: bool) -> None:
     """Below 0.7 of it or above 1.4."""
-    assert (mode_in_operation(driven(noise=3e-5), DRIVEN_RATE, guess) is not None) is observed
+    assert (spectra.mode_in_operation(driven(noise=3e-5), DRIVEN_RATE, guess) is not None) is observed
 
 
 @pytest.mark.parametrize(('seconds', 'observed'), [(4.6, False), (4.8, True)])
@@ -226,19 +217,19 @@ def test_a_spectrum_of_thirty_lines_is_enough(seconds: float, observed: bool) ->
     samples = driven(seconds=seconds, zeta=0.05, noise=3e-5)
     assert (len(lines(samples, 14.0)[0]) == 30) is observed
     assert len(lines(samples, 14.0)[0]) in (29, 30)
-    assert (mode_in_operation(samples, DRIVEN_RATE, 14.0) is not None) is observed
+    assert (spectra.mode_in_operation(samples, DRIVEN_RATE, 14.0) is not None) is observed
 
 
 def test_a_steady_swing_is_no_driven_mode() -> None:
     """Nor are two modes one."""
     t = np.arange(6000) / DRIVEN_RATE
     noise = 3e-5 * np.random.default_rng(2).normal(size=6000)
-    assert mode_in_operation(1e-3 * np.sin(2.0 * np.pi * 14.0 * t) + noise, DRIVEN_RATE, 14.0) is None
-    assert mode_in_operation(driven() + driven(17.0, 0.01, seed=2) + noise, DRIVEN_RATE, 14.0) is None
+    assert spectra.mode_in_operation(1e-3 * np.sin(2.0 * np.pi * 14.0 * t) + noise, DRIVEN_RATE, 14.0) is None
+    assert spectra.mode_in_operation(driven() + driven(17.0, 0.01, seed=2) + noise, DRIVEN_RATE, 14.0) is None
 
 
 def test_ratios_as_they_should_be_pass() -> None:
     rng = np.random.default_rng(6)
-    assert sum(scatters_as_exponential(rng.exponential(size=200)) for _ in range(40)) >= 39
-    assert not scatters_as_exponential(1.5 * rng.exponential(size=1000))
-    assert not scatters_as_exponential(np.ones(1000) + 1e-3 * rng.normal(size=1000) + 0.8)
+    assert sum(spectra.scatters_as_exponential(rng.exponential(size=200)) for _ in range(40)) >= 39
+    assert not spectra.scatters_as_exponential(1.5 * rng.exponential(size=1000))
+    assert not spectra.scatters_as_exponential(np.ones(1000) + 1e-3 * rng.normal(size=1000) + 0.8)
