@@ -294,6 +294,10 @@ def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serv
         page.until('document.getElementById("record").textContent === "● Recording"')
         assert page.js('document.documentElement.scrollWidth') <= width
         assert page.js(STICKING_OUT) == []
+        ends = (
+            'arguments[0].map((b) => b.parentElement.getBoundingClientRect().right - b.getBoundingClientRect().right)'
+        )
+        assert max(page.js(ends, page.driver.find_elements(By.CLASS_NAME, 'enlarge'))) < 20
         header = page.js('document.querySelector("header").getBoundingClientRect().height')
         assert header < 100
     finally:
