@@ -264,6 +264,7 @@ def test_the_first_load_is_small_and_dx_is_above_dy(page: Page, serve: Callable[
     page.until(f'{HEIGHTS}.every(Number.isFinite)', 'traces of dX and dY')
     dx, dy = page.js(HEIGHTS)
     assert dx < dy - 20
+    assert page.js('["sd_dx", "sd_dy", "sd_theta"].every((id) => document.getElementById(id).title)')
     # A label of an enlarged axis is of its tick's time: half a second is not rounded away.
     assert page.later('import("/page/charts.js").then((m) => [2.5, 1, 0.25].map(m.decimals))') == [1, 0, 2]
     assert 20_000 < page.js(FETCHED) < MOST_BYTES
@@ -293,6 +294,10 @@ def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serv
         page.until('document.getElementById("record").textContent === "● Recording"')
         assert page.js('document.documentElement.scrollWidth') <= width
         assert page.js(STICKING_OUT) == []
+        ends = (
+            'arguments[0].map((b) => b.parentElement.getBoundingClientRect().right - b.getBoundingClientRect().right)'
+        )
+        assert max(page.js(ends, page.driver.find_elements(By.CLASS_NAME, 'enlarge'))) < 20
         header = page.js('document.querySelector("header").getBoundingClientRect().height')
         assert header < 100
     finally:
