@@ -268,6 +268,7 @@ def test_every_study_can_be_asked_from_python(tmp_path: Path) -> None:
     }
     for name, answer in answers.items():
         first, *_ = answer.page_sentences()
+        assert repr(answer).count('\n') < 20
         files = {path.name: path for path in answer.save(tmp_path / answer.study)}
         assert {name, 'report.html'} <= set(files)
         assert json.loads(files[name].read_text()) == json.loads(answer.json())

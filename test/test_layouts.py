@@ -88,6 +88,36 @@ def test_rviz() -> None:
         assert given.reliable
 
 
+def test_an_analyzer_takes_each_part_of_the_diagnostics() -> None:
+    (tree,) = yaml.safe_load((CONFIG / 'diagnostics.yaml').read_text()).values()
+    analyzers = [a for a in tree['ros__parameters'].values() if isinstance(a, dict)]
+    assert {a['type'] for a in analyzers} == {'diagnostic_aggregator/GenericAnalyzer'}
+    files = [path for room in ('run', 'ros') for path in (ROOT / 'psd_deflection' / room).glob('*.py')]
+    parts = {part for path in files for part in re.findall(r"'psd_deflection: (\w+)", path.read_text())}
+    starts = [start for a in analyzers for start in a['startswith']]
+    assert {part: [s for s in starts if f'estimator: {part}'.startswith(s)] for part in parts} == {
+        part: [f'estimator: {part}'] for part in parts
+    }
+    assert len(starts) == len(parts) > 7
+
+
+def test_the_xacro_macro_hangs_the_link_on_a_robot(tmp_path: Path) -> None:
+    xacro = pytest.importorskip('xacro')
+    robot = tmp_path / 'robot.urdf.xacro'
+    robot.write_text(f"""<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+      <link name="tool0"/>
+      <xacro:include filename="{CONFIG}/psd_link.urdf.xacro"/>
+      <xacro:psd_link parent="tool0" prefix="left_" length="0.8"><origin xyz="0 0 0.1"/></xacro:psd_link>
+    </robot>""")
+    urdf = xml.etree.ElementTree.fromstring(xacro.process_file(str(robot)).toxml())
+    joint = urdf.find('joint')
+    assert joint is not None
+    assert [(e.tag, *e.attrib.values()) for e in joint] == [
+        *(('parent', 'tool0'), ('child', f'left_{BASE}'), ('origin', '0 0 0.1')),
+    ]
+    assert urdf.findall(f"link[@name='left_{BASE}']/visual/origin")[0].get('xyz') == '0 0 0.4'
+
+
 def test_the_sros2_policy() -> None:
     root = xml.etree.ElementTree.parse(CONFIG / 'sros2_policy.xml').getroot()
     enclaves = {str(e.get('path')): e for e in root.iter('enclave')}

@@ -32,7 +32,7 @@ for word in "$@"; do
       : >"/var/lib/dpkg/info/$word.list"
       printf 'Package: %s\nStatus: install ok installed\nVersion: 1\nArchitecture: all\n' "$word" >>/var/lib/dpkg/status
       printf 'Maintainer: none\nDescription: none\n\n' >>/var/lib/dpkg/status;;
-    python3-colcon-common-extensions) words+=(colcon python3-colcon-{defaults,library-path,notification,output} \
+    python3-colcon-common-extensions) words+=(colcon python3-colcon-{bash,defaults,library-path,notification,output} \
       python3-colcon-{package-information,package-selection,parallel-executor,recursive-crawl,ros,test-result});;
     *) words+=("$word");;
   esac
@@ -62,8 +62,8 @@ apt-get update -qq
 apt-get install -qq --no-install-recommends build-essential ca-certificates git libxml2-utils \
     python3-{argcomplete,dev,empy,importlib-metadata,lark,netifaces,osrf-pycommon,pip,psutil,rosdep2,venv}
 python3 -m pip install --quiet --break-system-packages -c /opt/ubuntu-24.04.txt \
-    numpy scipy pyserial PyYAML ruamel.yaml tqdm zstandard aiohttp jsonschema==4.10.3 setuptools==68.1.2 \
-    pytest==7.4.4 pytest-xdist==3.4.0 pytest-timeout==2.2.0
+    numpy scipy pandas pyserial PyYAML ruamel.yaml tqdm zstandard aiohttp jsonschema==4.10.3 setuptools==68.1.2 \
+    hypothesis==6.98.15 pytest==7.4.4 pytest-xdist==3.4.0 pytest-timeout==2.2.0
 """
 """What the image of ROS has, and the versions of Ubuntu 24.04 over those of Debian."""
 
@@ -97,7 +97,7 @@ def ready(chroot: Path, ros: Path, rosdistro: Path) -> dict[str, str]:
 def main(argv: list[str] | None = None) -> int:
     """Prints what became of each step; the exit status is 1 where one failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('ros', type=Path, help='what stands for /opt/ros/jazzy: wheels; sources of ros2cli and launch')
+    parser.add_argument('ros', type=Path, help='what stands for /opt/ros/jazzy (docs/releasing.md)')
     parser.add_argument('rosdistro', type=Path, help='a checkout of ros/rosdistro')
     parser.add_argument('--chroot', type=Path, default=ROOT / 'build/apt_job')
     parser.add_argument('--skip', default='', help='a step to leave out')
@@ -107,6 +107,7 @@ def main(argv: list[str] | None = None) -> int:
     job = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']['apt']
     row = next(row for row in job['strategy']['matrix']['include'] if row['ros'] == 'jazzy')
     env = {'ROS': 'jazzy', 'RUNNER_TEMP': '/root/temp', 'ROS_OS_OVERRIDE': 'ubuntu:24.04:noble'}
+    env['ROS_DOMAIN_ID'] = os.environ.get('ROS_DOMAIN_ID', '0')
     env |= {'PATH': '/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin', **ready(chroot, options.ros, options.rosdistro)}
     words = ' '.join(f"'{name}={value}'" for name, value in env.items())
     failed = 0

@@ -1,6 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Builds the action FollowJointTrajectory for a Python without ROS 2 from apt: control_msgs has no wheel."""
+"""Builds what has no wheel for a Python without ROS 2 from apt: FollowJointTrajectory of control_msgs, or of another
+package: ``python -m tools.control_msgs tf2_msgs`` prints the folder that belongs into PYTHONPATH."""
 
 import fcntl
 import hashlib
@@ -17,8 +18,6 @@ from tools.program import ROOT
 
 PACKAGE = 'control_msgs'
 FOLDER = ROOT / 'build' / PACKAGE
-GIVEN = ROOT / 'tools' / 'control_msgs_interface'
-DEFINITIONS = sorted(file for file in GIVEN.rglob('*.*'))
 USED = (
     *('action_msgs', 'builtin_interfaces', 'geometry_msgs', 'service_msgs', 'std_msgs', 'trajectory_msgs'),
     *('type_description_interfaces', 'unique_identifier_msgs'),
@@ -34,16 +33,25 @@ KINDS = ('rosidl_generator_c', *SUPPORTS, 'rosidl_typesupport_c', 'rosidl_genera
 """Of sources, each of which becomes a library that may use those before it."""
 
 
-def installed() -> bool:
+def _given(package: str) -> Path:
+    return ROOT / 'tools' / f'{package}_interface'
+
+
+def installed(package: str = PACKAGE) -> bool:
     """Whether this Python has the package."""
-    return importlib.util.find_spec(PACKAGE) is not None
+    return importlib.util.find_spec(package) is not None
+
+
+def buildable() -> bool:
+    """Whether compiler and generators are there."""
+    return shutil.which('g++') is not None and importlib.util.find_spec('rosidl_generator_py') is not None
 
 
 def available() -> bool:
     """Have it: installed, or built here and from now on the path, of our children too. False if it cannot be."""
     if installed():
         return True
-    if shutil.which('g++') is None or importlib.util.find_spec('rosidl_generator_py') is None:
+    if not buildable():
         return False
     place = str(built())
     sys.path.append(place)
@@ -52,27 +60,27 @@ def available() -> bool:
     return installed()
 
 
-def built() -> Path:
+def built(package: str = PACKAGE) -> Path:
     """The folder in which the package lies, once it is whole. RuntimeError with what the compiler said."""
-    key = hashlib.sha256(b''.join(f.read_bytes() for f in (Path(__file__), *DEFINITIONS)))
-    key.update(f'{sys.version}{sys.prefix}'.encode())
+    key = hashlib.sha256(b''.join(f.read_bytes() for f in (Path(__file__), *sorted(_given(package).rglob('*.*')))))
+    key.update(f'{package}{sys.version}{sys.prefix}'.encode())
     place = FOLDER / key.hexdigest()[:16]
     FOLDER.mkdir(parents=True, exist_ok=True)
     with (FOLDER / 'lock').open('w') as lock:
         # The workers of pytest come at once.
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (place / PACKAGE).is_dir():
+        if not (place / package).is_dir():
             work = FOLDER / 'work'
             shutil.rmtree(work, ignore_errors=True)
-            _generate(work)
+            _generate(work, package)
             shutil.rmtree(place, ignore_errors=True)
             place.mkdir()
-            _compile(work).rename(place / PACKAGE)
+            _compile(work, package).rename(place / package)
     return place
 
 
-def _generate(work: Path) -> None:
-    """Sources in ``work/KIND/control_msgs``, as the generators write them."""
+def _generate(work: Path, package: str) -> None:
+    """Sources in ``work/KIND/PACKAGE``, as the generators write them."""
     from rosidl_adapter.action import convert_action_to_idl
     from rosidl_adapter.msg import convert_msg_to_idl
     from rosidl_generator_c.cli import GenerateC
@@ -82,16 +90,17 @@ def _generate(work: Path) -> None:
     from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
     from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
 
+    given_from = _given(package)
     os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-    given_in = work / PACKAGE
-    shutil.copytree(GIVEN, given_in)
-    names = [file.relative_to(GIVEN) for file in DEFINITIONS]
+    given_in = work / package
+    shutil.copytree(given_from, given_in)
+    names = [file.relative_to(given_from) for file in sorted(given_from.rglob('*.*'))]
     for name in names:
         convert = convert_msg_to_idl if name.suffix == '.msg' else convert_action_to_idl
-        convert(given_in, PACKAGE, name, (given_in / name).parent)
+        convert(given_in, package, name, (given_in / name).parent)
     given = [f'{given_in}:{name.with_suffix(".idl")}' for name in names]
-    shares = [Path(sys.prefix) / 'share' / package for package in USED]
-    hashes = HashTypeDescription('').generate_type_hashes(PACKAGE, given, shares, given_in)
+    shares = [Path(sys.prefix) / 'share' / used for used in USED]
+    hashes = HashTypeDescription('').generate_type_hashes(package, given, shares, given_in)
     makers = (
         GenerateC(''),
         GenerateFastRTPSCTypesupport(''),
@@ -101,14 +110,14 @@ def _generate(work: Path) -> None:
     )
     for kind, maker in zip(KINDS, makers, strict=True):
         more = [hashes] if kind == KINDS[0] else []
-        maker.generate(PACKAGE, given, shares, work / kind / PACKAGE, *more)
+        maker.generate(package, given, shares, work / kind / package, *more)
 
 
-def _compile(work: Path) -> Path:
+def _compile(work: Path, package: str) -> Path:
     """The package that rclpy imports, with a library for each kind in it."""
     import numpy as np
 
-    prefix, out = Path(sys.prefix), work / KINDS[-1] / PACKAGE
+    prefix, out = Path(sys.prefix), work / KINDS[-1] / package
     (out / '__init__.py').touch()
     include = [work / kind for kind in KINDS]
     include += [Path(sysconfig.get_path('include')), Path(np.get_include()), prefix / 'include']
@@ -122,9 +131,9 @@ def _compile(work: Path) -> Path:
     with ThreadPoolExecutor(2) as two:
         list(two.map(one, (file for _, file in files)))
     # A library is found by its name once it is loaded: the last one loads all of them.
-    names = {kind: f'lib{PACKAGE}__{kind}.so' for kind in KINDS[:-1]}
-    names[KINDS[-1]] = f'{PACKAGE}_s__rosidl_typesupport_c{sysconfig.get_config_var("EXT_SUFFIX")}'
-    needed = [*(f'{package}__{kind}' for package in USED for kind in KINDS), *RUNTIME]
+    names = {kind: f'lib{package}__{kind}.so' for kind in KINDS[:-1]}
+    names[KINDS[-1]] = f'{package}_s__rosidl_typesupport_c{sysconfig.get_config_var("EXT_SUFFIX")}'
+    needed = [*(f'{used}__{kind}' for used in USED for kind in KINDS), *RUNTIME]
     of_ros = [f'-l{name}' for name in needed if (prefix / 'lib' / f'lib{name}.so').exists()]
     before: list[str] = []
     for kind, name in names.items():
@@ -142,4 +151,4 @@ def _run(*words: str) -> None:
 
 
 if __name__ == '__main__':
-    print(built())
+    print(built(*sys.argv[1:]))

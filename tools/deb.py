@@ -21,8 +21,8 @@ LONGEST = 3600.0  # s: longer than this nobody waits for a step on a busy machin
 
 ENTER = """
 mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc" && mount --bind /tmp "$1/tmp" || exit 1
-cp /etc/resolv.conf "$1/etc/resolv.conf"
-cp /etc/ssl/certs/ca-certificates.crt "$1/etc/ssl/ours.crt"
+cp /etc/resolv.conf /etc/hosts "$1/etc"
+mkdir -p "$1/etc/ssl" && cp /etc/ssl/certs/ca-certificates.crt "$1/etc/ssl/ours.crt"
 exec env -i HOME=/root TERM=dumb LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive PIP_CERT=/etc/ssl/ours.crt \\
     PATH=/usr/sbin:/usr/bin:/sbin:/bin chroot "$1" sh -ec "$2"
 """

@@ -1,7 +1,14 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the commands of README and docs as a reader would: ``make docs STEP=commands``."""
+"""Runs the commands and the Python of README and docs as a reader would: ``make docs STEP=commands``.
 
+``--clean``: in the environment that the pages tell a reader to make, without the tools of the tests: what `make run`
+installs, and on a page what that page's lines of pip add.
+"""
+
+import configparser
+import contextlib
+import importlib.metadata
 import json
 import os
 import re
@@ -19,16 +26,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tools.program import PSD_DEFLECTION, ROOT, Program, copy_checkout, ros_domain
-from tools.tasks import SHORTEST_BENCH, TASKS
+from tools.tasks import SHORTEST_BENCH, TASKS, install
 
 WAIT_S = 1200.0
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+NOTEBOOKS = sorted((ROOT / 'docs').glob('*.ipynb'))
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
 INLINE = re.compile(r'`((?:make|psd-deflection|python|python3|pip|apt|sudo|colcon|ros2) [^`\n]+)`')
 SPOKEN_OF = re.compile(r'(psd-deflection (NAME|[a-z-]+)|ros2 [a-z]+( [a-z]+)?)$')
 """Names of commands that take arguments: no reader types them as they stand."""
 INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,}.+\n)*', re.M)
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
+DEVICE = 'ttyACM0'  # Where the simulated device is that a line with /dev/ttyACM0 gets.
 CUT = 'recordings/cut'  # A recording that a crash left without its end.
 
 _TABLES = tomllib.loads((ROOT / 'tools' / 'run_commands.toml').read_text(encoding='utf-8'))
@@ -46,15 +55,11 @@ HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says not
 FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b|make release STEP=apt\b)')
 """Reads data of others, which are not in the repository."""
 
-NO_CAMPAIGNS = '--no-campaigns'
+NO_CAMPAIGNS, CLEAN = '--no-campaigns', '--clean'
 
 NEVER_HERE = ('a machine to administer', 'ros2', 'two hours', 'the data of others')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
-QUICK = re.compile(
-    r'^psd-deflection (info|replay|convert|plot|budget|design|params|effects|completion|thesis)\b'
-    r'|^psd-deflection simulate .*--(out|help)\b'
-)
 LIVE = re.compile(
     r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
     r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
@@ -124,12 +129,6 @@ JOURNEYS = ('docs/first-day.md', 'docs/first-month.md')
 """Paths of which every line is typed, in its order, also what is run elsewhere."""
 
 
-def is_quick(line: str) -> bool:
-    """Whether the tests run it within themselves; `replay --watch` is of what the line before it has recorded."""
-    slow = '--serve' in line or '--watch' in line
-    return QUICK.search(line) is not None and not slow and run_by_ci(line) is None
-
-
 def shortest(line: str) -> tuple[str, str, str]:
     """The target, shortest arguments and verdict of a ``make`` line that has a short form; three '' otherwise."""
     if line.startswith('make bench'):
@@ -151,26 +150,66 @@ def is_campaign(line: str) -> bool:
     return shortest(line)[0] != '' or (line.startswith('python') and typed_as(line) != line)
 
 
+WRITES = re.compile(r' --out\b|>|^(cp|sed)\b')
+
+
 def blocks_to_run() -> list[list[Command]]:
-    """What is run here, in the documents' order; blocks that are quick throughout are left to the tests."""
+    """What is run here, in the documents' order: a line once, or once a page if it writes or the page needs more."""
     blocks: dict[int, list[Command]] = {}
-    observed: set[str] = set()
+    observed: set[tuple[str, str]] = set()
     for command in commands():
         blocks.setdefault(command.block, []).append(command)
     out = []
     for block in blocks.values():
-        if block[0].page in JOURNEYS:
-            out.append([c for c in block if run_by_ci(c.line) is None])
-            continue
-        if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
-            continue
-        left = [c for c in block if run_by_ci(c.line) is None and typed_as(c.line) not in observed]
-        # The lines below it may need what a quick one writes.
-        left = [c for c in left if not is_quick(c.line) or ' --out ' in c.line]
-        observed.update(typed_as(c.line) for c in left)
+        left = []
+        for c in block:
+            own = c.page in JOURNEYS or WRITES.search(c.line) or extras_of(c.page)
+            key = (c.page if own and not is_campaign(c.line) else '', typed_as(c.line))
+            if run_by_ci(c.line) is None and (key not in observed or c.page in JOURNEYS):
+                left.append(c)
+                observed.add(key)
         if left:
             out.append(left)
     return out
+
+
+PIP = re.compile(r"""pip install '?(?:(?:\.|psd_deflection)\[(?P<extras>[a-z0-9,]+)\]|(?P<package>[a-z]+))(?=['`\s])""")
+TRIED_ALONE = frozenset({'rerun'})  # `make demo NAME=rerun` has an environment of its own.
+
+
+def extras_of(page: str) -> list[str]:
+    """The packages that the lines of pip of ``page`` add to what `make run` installs."""
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    wanted = []
+    for found in PIP.finditer((ROOT / page).read_text(encoding='utf-8')):
+        wanted += [found['package']] if found['package'] else []
+        for extra in set((found['extras'] or '').split(',')) - {*BASE, *TRIED_ALONE, ''}:
+            wanted += setup['options.extras_require'][extra].split()
+    return sorted(set(wanted))
+
+
+BASE = ('ros', 'monitor', 'plot')
+"""The extras that `make run` installs."""
+
+
+def python_of(page: str, folder: Path) -> list[str]:
+    """Lines that run each Python block of ``page`` and its sessions with their answers, or the cells of a notebook."""
+    text, lines, session = (ROOT / page).read_text(encoding='utf-8'), [], ''
+    if page.endswith('.ipynb'):
+        code = [''.join(cell['source']) for cell in json.loads(text)['cells'] if cell['cell_type'] == 'code']
+        (folder / 'notebook.py').write_text('\n'.join(code), encoding='utf-8')
+        return ['python notebook.py']
+    for number, fence in enumerate(FENCE.finditer(text)):
+        if fence['kind'] == 'pycon':
+            session += fence['text'] + '\n'
+        elif fence['kind'] == 'python':
+            (folder / f'block_{number}.py').write_text(fence['text'], encoding='utf-8')
+            lines.append(f'python block_{number}.py')
+    if session:
+        (folder / 'session.txt').write_text(session, encoding='utf-8')
+        lines.append('python -m doctest -o ELLIPSIS -o NORMALIZE_WHITESPACE session.txt')
+    return lines
 
 
 def what_is_missing(line: str) -> str:
@@ -194,11 +233,64 @@ def stale() -> list[str]:
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
 
-class Reader:
-    """A reader who types the documented commands in ``folder``."""
+OF_THE_TOOLS = re.compile(r'^(make (?!run\b)|python (-m )?(bench|blind|tools)\b)')
+"""Lines of who changes the code: README says that they need `make setup`; a target of make installs what it needs."""
 
-    def __init__(self, folder: Path) -> None:
+
+class CleanRoom:
+    """What a reader has: ``folder/.venv`` as `make run` installs it, and of the environment's variables a few.
+
+    ``beside``: a folder for the home of its own.
+    """
+
+    def __init__(self, folder: Path, beside: Path) -> None:
+        self._venv = folder / '.venv'
+        self._ours = {**os.environ}
+        bare = {k: v for k, v in os.environ.items() if k not in ('MAKEFLAGS', 'WITH', 'VENV', 'VIRTUAL_ENV')}
+        subprocess.run(['make', f'PYTHON={sys.executable}', '.venv/.installed'], cwd=folder, env=bare, check=True)
+        self._base = self._installed()
+        kept = ('ROS_DOMAIN_ID', 'ROS_LOG_DIR', 'XDG_STATE_HOME', 'LANG', 'TERM', 'OMP_NUM_THREADS')
+        self._reader = {name: os.environ[name] for name in kept if name in os.environ}
+        self._reader |= {'PATH': f'{self._venv}/bin:/usr/local/bin:/usr/bin:/bin', 'HOME': str(beside / 'home')}
+        Path(self._reader['HOME']).mkdir()
+
+    def _installed(self) -> dict[str, str]:
+        places = [str(place) for place in self._venv.glob('lib/python*/site-packages')]
+        return {d.name: d.version for d in importlib.metadata.distributions(path=places)}
+
+    @contextlib.contextmanager
+    def page(self, name: str) -> Iterator[None]:
+        """Have what the lines of pip of the page ``name`` add, until its end."""
+        wanted = extras_of(name)
+        if wanted:
+            install(wanted, str(self._venv))
+        yield
+        more = self._installed().keys() - self._base.keys()
+        if more:
+            pip = [f'{self._venv}/bin/python', '-m', 'pip', 'uninstall', '--quiet', '--yes', *sorted(more)]
+            subprocess.run(pip, check=True)
+
+    @contextlib.contextmanager
+    def typing(self, line: str) -> Iterator[None]:
+        """Have the variables with which ``line`` is typed."""
+        variables = self._ours if OF_THE_TOOLS.search(line) else self._reader
+        before = {**os.environ}
+        try:
+            os.environ.clear()
+            os.environ.update(variables)
+            yield
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+
+
+class Reader:
+    """A reader who types the documented commands in ``folder``; ``room``: a clean one, or None for our environment."""
+
+    def __init__(self, folder: Path, room: CleanRoom | None = None) -> None:
         self._folder = folder
+        self._room = room
+        self._program = 'psd-deflection' if room else shlex.join(PSD_DEFLECTION)
         self._device: Program | None = None
         self._background: list[Program] = []
         self._served = ''
@@ -210,7 +302,8 @@ class Reader:
                 began = time.monotonic()
                 failed = ''
                 try:
-                    self.type(filled(line, CUT))
+                    with self._room.typing(line) if self._room else contextlib.nullcontext():
+                        self.type(filled(line, CUT))
                 except (RuntimeError, OSError, subprocess.SubprocessError) as error:
                     failed = str(error)
                 ran(line, time.monotonic() - began, failed)
@@ -221,9 +314,9 @@ class Reader:
 
     def type(self, line: str) -> None:
         line += next((f' {arguments}' for pattern, arguments in SHORTER.items() if re.search(pattern, line)), '')
-        line = line.replace('/dev/ttyACM0', 'ttyACM0').replace('/dev/pts/3', self._served)
-        if 'ttyACM0' in line and self._device is None:
-            self._device = self._start('psd-deflection simulate --serve --link ttyACM0')
+        line = line.replace('/dev/ttyACM0', DEVICE).replace('/dev/pts/3', self._served)
+        if DEVICE in line and self._device is None:
+            self._device = self._start(f'psd-deflection simulate --serve --link {DEVICE}')
             self._device.until('port: ')
         if line.startswith('curl '):
             self._press(line)
@@ -252,7 +345,7 @@ class Reader:
 
     def _start(self, line: str) -> Program:
         """The line in a terminal, as a person types it."""
-        words = line.replace('psd-deflection', shlex.join(PSD_DEFLECTION), 1) if line.startswith('psd-') else line
+        words = line.replace('psd-deflection', self._program, 1) if line.startswith('psd-') else line
         return Program(['bash', '-c', f'exec {words}'], self._folder, terminal=True, wait_s=WAIT_S)
 
     def _to_the_end(self, line: str, verdict: str = '') -> None:
@@ -318,11 +411,12 @@ class Reader:
 
 def main() -> int:
     """Run all blocks, or those with the words given in a ``PAGE: LINE``; the exit status is 1 where one failed.
-    ``--no-campaigns``: without those that have a short form."""
+    ``--no-campaigns``: without those that have a short form. ``--clean``: as the module says."""
     # A shell that runs us in the background has it ignored, and so would all that we start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    options = {NO_CAMPAIGNS, CLEAN}
     campaigns = NO_CAMPAIGNS not in sys.argv
-    only = ' '.join(word for word in sys.argv[1:] if word != NO_CAMPAIGNS)
+    only = ' '.join(word for word in sys.argv[1:] if word not in options)
     environment = Path(sys.prefix)
     failures = 0
     with tempfile.TemporaryDirectory() as temporary, ros_domain() as domain:
@@ -340,7 +434,8 @@ def main() -> int:
             ROS_LOG_DIR=f'{temporary}/log',
             XDG_STATE_HOME=f'{temporary}/state',
         )
-        reader = Reader(folder)
+        room = CleanRoom(folder, Path(temporary)) if CLEAN in sys.argv else None
+        reader = Reader(folder, room)
         if shutil.which('ros2'):
             # Without it the first `ros2 lifecycle` sees what it meets in half a second.
             subprocess.run(['ros2', 'daemon', 'start'], check=True)
@@ -353,18 +448,39 @@ def main() -> int:
                 print(failed, flush=True)
 
         passed_over: dict[str, list[str]] = {}
+
+        def typed(block: list[Command]) -> list[str]:
+            nonlocal failures
+            lines = [c.line for c in block if only in f'{c.page}: {c.line}']
+            for line in [*lines]:
+                if not campaigns and is_campaign(line):
+                    lines.remove(line)
+                    passed_over.setdefault(NO_CAMPAIGNS, []).append(line)
+                elif missing := what_is_missing(line):
+                    lines.remove(line)
+                    passed_over.setdefault(missing, []).append(line)
+                    failures += os.environ.get('NEED_TOOLS') == '1' and missing not in NEVER_HERE
+            return lines
+
+        at_first = {*folder.iterdir(), folder / DEVICE}
+        blocks: dict[str, list[list[Command]]] = {str(page.relative_to(ROOT)): [] for page in (*PAGES, *NOTEBOOKS)}
+        for block in blocks_to_run():
+            blocks[block[0].page].append(block)
         try:
-            for block in blocks_to_run():
-                lines = [c.line for c in block] if any(only in f'{c.page}: {c.line}' for c in block) else []
-                for line in [*lines]:
-                    if not campaigns and is_campaign(line):
-                        lines.remove(line)
-                        passed_over.setdefault(NO_CAMPAIGNS, []).append(line)
-                    elif missing := what_is_missing(line):
-                        lines.remove(line)
-                        passed_over.setdefault(missing, []).append(line)
-                        failures += os.environ.get('NEED_TOOLS') == '1' and missing not in NEVER_HERE
-                reader.block(lines, ran)
+            for page, of_page in blocks.items():
+                to_type = [lines for lines in map(typed, of_page) if lines]
+                to_type += [[line] for line in python_of(page, folder) if only in f'{page}: {line}']
+                if not to_type:
+                    continue
+                with room.page(page) if room else contextlib.nullcontext():
+                    for lines in to_type:
+                        reader.block(lines, ran)
+                # Two pages may write the same name; the second journey goes on from the first.
+                for made in {*folder.iterdir()} - at_first if page not in JOURNEYS else ():
+                    if made.is_dir() and not made.is_symlink():
+                        shutil.rmtree(made)
+                    else:
+                        made.unlink()
         finally:
             reader.close()
             if shutil.which('ros2'):

@@ -130,7 +130,7 @@ def edited(text: str, edit: Callable[[Any], None]) -> str:
         tree = writer.load(text)
         edit(tree)
         writer.dump(tree, out)
-    except (YAMLError, ValueError, TypeError, RecursionError) as error:
+    except (YAMLError, ValueError, TypeError, IndexError, RecursionError) as error:
         raise YamlError(f'cannot be written again ({type(error).__name__})') from None
     return out.getvalue()
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import in_pairs
-from psd_deflection.records import FloatArray, RawChunk, SampleBlock
+from psd_deflection.records import FloatArray, IntArray, RawChunk, SampleBlock
 
 
 class BlockCutter:
@@ -78,22 +78,21 @@ class BlockCutter:
         )
 
 
-def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> int:
-    """Time of the middle of the whole block, ns, from the samples that are present.
+def middles_ns(seq: IntArray, t_ns: IntArray, block_size: int, period_ns: float) -> list[int]:
+    """Time of the middle of each whole block, ns, from the samples that are present: ``seq``, ``t_ns`` (B, n).
 
     Each sample gives an estimate of the time of slot (N-1)/2. The result is their mean, so a lost
     sample moves the stamp by no more than the clock's jitter. The mean of the remaining samples belongs to
     another time: :mod:`psd_deflection.measure.uncertainty.block_fit` gives the value at the stamp.
     """
-    first = int(block.t_ns[0])
-    count = len(block.seq)
-    offsets = (block.t_ns - first).sum() / count
+    count = t_ns.shape[1]
+    first = t_ns[:, 0]
+    offsets = (t_ns - first[:, None]).sum(axis=1) / count
     # Of a whole block the mean slot is the middle.
-    to_middle = 0.0
     if count < block_size:
-        slots = block.seq - block.index * block_size
-        to_middle = (0.5 * (block_size - 1) - slots.sum() / count) * period_ns
-    return first + round(float(offsets) + float(to_middle))
+        offsets += (0.5 * (block_size - 1) - (seq % block_size).sum(axis=1) / count) * period_ns
+    middles: list[int] = (first + np.rint(offsets).astype(np.int64)).tolist()
+    return middles
 
 
 Volts = npt.NDArray[np.float32]

@@ -13,27 +13,26 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
+from psd_deflection.measure.solving import BlockReadings, Dots, ReadingsRun, SolverAnswer, SolverSet
 from psd_deflection.measure.state import State, Value, numbers
 from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
-from psd_deflection.measure.uncertainty.block_fit import Fitted
+from psd_deflection.measure.uncertainty.block_fit import FittedRun
 from psd_deflection.measure.uncertainty.consistency import ConsistencyResult, Unexplained, widened
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.misalignment.rig import ParameterCovariance
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.solvers import solver_from_rig
-from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.interface import Solution, Solver
 from psd_deflection.model.solvers.registry import solver_class
 from psd_deflection.model.solvers.subset import NAME as ONE_PSD
-from psd_deflection.model.solvers.subset import OnePsd, subset_solver
+from psd_deflection.model.solvers.subset import OnePsd
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 
 HELD, SYSTEMATIC, ZERO_VARIANCES = 'state.held_twist', 'state.systematic', 'state.zero_variances'
 """Names of the state of :class:`Estimation`."""
 
-Dots = tuple[float, ...]
 Failure = tuple[BlockStatus, str]
 
 
@@ -63,19 +62,6 @@ class HeldTwist(NamedTuple):
     t_ns: int
     theta: float
     variance: float
-
-
-class BlockReadings(NamedTuple):
-    """Readings of one block that are solved together.
-
-    ``psds``: whose they are. ``dots`` (C,) m; ``variances`` (C,) m^2, the weights; ``covariance`` (C, C) m^2 of the
-    dots.
-    """
-
-    psds: PsdSet
-    dots: Dots
-    variances: tuple[float, ...]
-    covariance: FloatArray
 
 
 class SolvedReadings(NamedTuple):
@@ -152,11 +138,8 @@ class Estimation:
         self._rig, self._effects = rig, effects
         self._optics = OpticsHealth(rig)
         self._one_psd = OnePsd(Geometry.from_rig(rig))
-        config = rig.estimator
         self._set_parameter_covariance(self.zero_variances)
-        names = [config.solver, *(name for name in config.solvers if name != config.solver)]
-        self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
-        self._subset_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}  # Bound: sets of at most six PSDs.
+        self._solvers = SolverSet(rig)
 
     def _set_parameter_covariance(self, zero_variances: tuple[float, ...]) -> None:
         """Take the uncertainty of the calibration, and of a zero with these variances (2P,) m^2, () if it has none."""
@@ -190,7 +173,7 @@ class Estimation:
     @property
     def primary(self) -> Solver:
         """The primary solver, of all detectors."""
-        return self._solvers[0][1]
+        return self._solvers.primary
 
     def gain_at_rest(self) -> FloatArray:
         """(3, 2P): how the primary solver's answer goes with the dots at the rig's zero."""
@@ -212,16 +195,22 @@ class Estimation:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""
         return self.estimator.mean_variances(size) if self.estimator.on_plate else self.variances[-1]
 
-    def fits(self, blocks: Sequence[ValidBlock]) -> Iterator[Fitted]:
-        """Yield the fit of all readings of each block whose verdict is OK; those with the same places are computed
+    def fits(self, blocks: Sequence[ValidBlock]) -> Iterator[BlockReadings]:
+        """Yield all readings, fitted, of each block whose verdict is OK; those with the same places are computed
         together.
         """
         good = [block for block in blocks if block.verdict.status is BlockStatus.OK]
         for _, same in itertools.groupby(good, key=lambda block: block.slots.tobytes()):
-            run = list(same)
-            yield from self.estimator.fits(self.estimator.full, run[0].slots, np.stack([own.samples for own in run]))
+            together = list(same)
+            slots, samples = together[0].slots, np.stack([own.samples for own in together])
+            fitted: FittedRun | None = None
+            for own, at in self.estimator.fits(self.estimator.full, slots, samples):
+                if own is not fitted:
+                    fitted, variances = own, self.variances[len(slots) - 1]
+                    run = ReadingsRun(self._solvers, self.estimator.full, own.dots, variances, own.covariance)
+                yield BlockReadings(run, at)
 
-    def solve(self, block: ValidBlock, fits: Iterator[Fitted]) -> BlockSolution:
+    def solve(self, block: ValidBlock, fits: Iterator[BlockReadings]) -> BlockSolution:
         """Return the primary solver's estimate of a block whose verdict is OK or names sound detectors.
 
         ``fits``: as :meth:`fits` has them, from this block on.
@@ -229,7 +218,9 @@ class Estimation:
         verdict = block.verdict
         variances = self._with_light(block, self.variances[len(block.slots) - 1])
         if verdict.status is BlockStatus.OK:
-            readings = self._readings(self.estimator.full, next(fits), block, variances)
+            readings = next(fits)
+            if verdict.findings:
+                readings = self._readings(readings.psds, readings.dots, readings.covariance, block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
             variances = self._with_light(block, self.estimator.mean_variances(len(block.slots)))
@@ -241,8 +232,10 @@ class Estimation:
 
     def other_estimates(self, block: ValidBlock, used: CheckedReadings) -> Iterator[DeflectionEstimate]:
         """Yield the estimates of the other solvers."""
-        answers = [(number, self._solution(number, used.readings)[0]) for number in range(1, len(self._solvers))]
-        yield from self._estimates(block, [(number, s) for number, s in answers if s is not None], used)
+        for number in range(1, len(self._solvers.names)):
+            answer = used.readings.answer(number)
+            if answer.solution is not None:
+                yield self._estimate(number, block, answer.solution, answer, used)
 
     def excluded(self, used: CheckedReadings | None) -> tuple[int, ...]:
         """Return the PSDs (from 1) without which a block was solved."""
@@ -273,7 +266,7 @@ class Estimation:
         return self._finish(block, dots, without, self._check(without, None), own.psds[number - 1] + 1)
 
     def _solved(self, readings: BlockReadings) -> SolvedReadings:
-        solution, failure = self._solution(0, readings)
+        solution, failure, *_ = readings.answer(0)
         if solution is None:
             return SolvedReadings(readings, None, failure)
         factor = (
@@ -340,75 +333,38 @@ class Estimation:
             reason = f'the {words} contradict each other: chi-square {checked.chi_square:.0f} of {checked.freedom}'
             return BlockSolution(dots, used, None, (BlockStatus.INCONSISTENT, reason))
         self.systematic = None
-        (estimate,) = self._estimates(block, [(0, solved.solution)], used)
+        estimate = self._estimate(0, block, solved.solution, solved.readings.answer(0), used)
         self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
         return BlockSolution(dots, used, estimate)
 
-    def _readings(self, psds: PsdSet, fitted: Fitted, block: ValidBlock, variances: tuple[float, ...]) -> BlockReadings:
-        """Return the readings of ``psds`` at the block's timestamp; ``variances`` (2P,) m^2 of all."""
+    def _readings(
+        self, psds: PsdSet, dots: Dots, covariance: FloatArray, block: ValidBlock, variances: tuple[float, ...]
+    ) -> BlockReadings:
+        """Return the fitted ``dots`` (C,) of ``psds`` as readings; ``variances`` (2P,) m^2 of all PSDs."""
         own = tuple([variances[i] for i in psds.columns])
-        return BlockReadings(psds, fitted.dots, own, self._covariance_of(block, fitted.covariance, psds.columns))
+        covariance = self._covariance_of(block, covariance, psds.columns)
+        return BlockReadings(ReadingsRun(self._solvers, psds, [dots], own, covariance[None]), 0)
 
     def _subset(self, psds: tuple[int, ...], block: ValidBlock, variances: tuple[float, ...]) -> BlockReadings | None:
         """Return the readings of ``psds`` (from 0) alone; None if the primary method cannot do with them."""
-        solver = self._solver(0, psds)
+        solver = self._solvers.of(0, psds)
         if solver is None:
             return None
         own = self.estimator.subset(psds, solver.tilts)
-        fitted = next(self.estimator.fits(own, block.slots, block.samples[None]))
-        return self._readings(own, fitted, block, variances)
-
-    def _solver(self, number: int, psds: tuple[int, ...]) -> Solver | None:
-        """Return solver ``number`` for ``psds`` (from 0); None if it cannot do with them."""
-        name, solver, _ = self._solvers[number]
-        if len(psds) == len(self._rig.psds):
-            return solver
-        key = (number, psds)
-        if key not in self._subset_solvers:
-            self._subset_solvers[key] = subset_solver(name, self._rig, psds)
-        return self._subset_solvers[key]
-
-    def _solution(self, number: int, readings: BlockReadings) -> tuple[Solution | None, str]:
-        """Return the solution of solver ``number``, or None and the reason."""
-        name = self._solvers[number][0]
-        solver = self._solver(number, readings.psds.psds)
-        if solver is None:
-            return None, f'{name}: takes all PSDs'
-        s = solver.solve(readings.dots, readings.variances)
-        if s.status is not SolverStatus.OK:
-            return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
-        return s, ''
-
-    def _estimates(
-        self, block: ValidBlock, answers: Sequence[tuple[int, Solution]], used: CheckedReadings
-    ) -> list[DeflectionEstimate]:
-        """Return the solutions of some solvers, by their numbers, with their covariances as estimates."""
-        readings = used.readings
-        gains = [self._gain(number, s, readings) for number, s in answers]
-        known = np.array([gain for gain in gains if gain is not None])
-        # Of all solvers at once: of so few numbers the calls cost most.
-        noises = iter(self._xp.einsum('sic,ck,sjk->sij', known, readings.covariance, known) if len(known) else ())
-        out = []
-        for (number, s), gain in zip(answers, gains, strict=True):
-            covariance: tuple[float, ...] = s.covariance
-            if gain is not None:
-                covariance = self._covariance(number, gain, next(noises), used)
-            out.append(self._estimate(number, block, s, covariance, used.checked))
-        return out
+        run, at = next(self.estimator.fits(own, block.slots, block.samples[None]))
+        return self._readings(own, run.dots[at], run.covariance[at], block, variances)
 
     def _estimate(
-        self,
-        number: int,
-        block: ValidBlock,
-        s: Solution,
-        covariance: tuple[float, ...],
-        checked: ConsistencyResult | None,
+        self, number: int, block: ValidBlock, s: Solution, answer: SolverAnswer, used: CheckedReadings
     ) -> DeflectionEstimate:
-        name, _, primary = self._solvers[number]
+        primary, checked = number == 0, used.checked
+        covariance: tuple[float, ...] = s.covariance
+        if answer.gain is not None and answer.noise is not None:
+            covariance = self._covariance(primary, answer.gain, answer.noise, used)
         return DeflectionEstimate(
             t_ns=block.t_ns,
             block=block.index,
-            solver=name,
+            solver=self._solvers.names[number],
             dx=s.dx,
             dy=s.dy,
             theta=s.theta,
@@ -421,26 +377,16 @@ class Estimation:
             on_own_topic=block.due,
         )
 
-    def _gain(self, number: int, s: Solution, readings: BlockReadings) -> FloatArray | None:
-        """Return the gain (3, C); None of a printed threshold method, which has no covariance and no slope either."""
-        solver = self._solver(number, readings.psds.psds)
-        if solver is None or s.covariance[0] != s.covariance[0]:
-            return None
-        return solver.gain(readings.dots, readings.variances, s)
-
-    def _covariance(self, number: int, gain: FloatArray, noise: FloatArray, used: CheckedReadings) -> tuple[float, ...]:
+    def _covariance(
+        self, primary: bool, gain: FloatArray, noise: FloatArray, used: CheckedReadings
+    ) -> tuple[float, ...]:
         """Return the covariance of a solution; ``noise`` (3, 3): by the noise of the readings alone."""
-        readings, checked = used.readings, used.checked
-        solver = self._solver(number, readings.psds.psds)
-        allowance = None if solver is None else solver.allowance(readings.dots, readings.variances)
-        if allowance is not None:
-            noise = noise + allowance
-        own = noise
+        own, checked = noise, used.checked
         if used.factor is not None:
             own = own + _through(gain, used.factor, self._xp)
         if checked is not None and self._rig.estimator.consistency == 'widen' and any(checked.possible):
             own = widened(own, gain, checked.possible, self._xp)
-        if number == 0 and own is not noise:
+        if primary and own is not noise:
             self.systematic = own - noise
         return tuple(own.ravel().tolist())
 

@@ -11,14 +11,14 @@ import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.averaging import BlockCutter, BlockMeasures, block_middle_ns, measured, of_one_length
+from psd_deflection.measure.averaging import BlockCutter, BlockMeasures, measured, middles_ns, of_one_length
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
-from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, ValidBlock
+from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Estimation, ValidBlock
 from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.motion.modal import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
+from psd_deflection.measure.solving import BlockReadings, Dots
 from psd_deflection.measure.state import FULL, STATE, Part, State, Value, load_states, numbers
-from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.vibration import why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation.catalogue import effects_of_rig
@@ -163,8 +163,12 @@ class Pipeline:
             raise ConfigError(
                 f'the samples are of {volts.shape[1] // 3} PSDs, the rig file has {len(self.rig.psds)} (psd_N.center)'
             )
-        for blocks in of_one_length(self._cutter.add(chunk, volts)):
-            yield from self._together(blocks)
+        yield from self.process_blocks(self._cutter.add(chunk, volts))
+
+    def process_blocks(self, blocks: Sequence[SampleBlock]) -> Iterator[Record]:
+        """The records of whole blocks of this rig in turn, as :meth:`process` has them."""
+        for together in of_one_length(blocks):
+            yield from self._together(together)
 
     def flush(self) -> Iterator[Record]:
         """The records of the unfinished block; call it when the stream ended or restarts."""
@@ -350,7 +354,7 @@ class Pipeline:
             blocks = blocks[done:]
 
     def _block(
-        self, block: SampleBlock, measures: BlockMeasures, observed: ValidBlock, fits: Iterator[Fitted]
+        self, block: SampleBlock, measures: BlockMeasures, observed: ValidBlock, fits: Iterator[BlockReadings]
     ) -> Iterator[Record]:
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
@@ -382,15 +386,18 @@ class Pipeline:
         yield self.last_spots
         yield block
 
-    def _classified(self, blocks: Iterable[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[ValidBlock]:
+    def _classified(self, blocks: Sequence[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[ValidBlock]:
         """The dots of each block, and whether lasers and detectors are sound."""
         frozen = self._stillness.blocks
-        for block, own in zip(blocks, measures, strict=True):
+        size = self._cutter.block_size
+        seq, t_ns = np.array([block.seq for block in blocks]), np.array([block.t_ns for block in blocks])
+        middles = middles_ns(seq, t_ns, size, self._period_ns)
+        for block, own, slots, middle in zip(blocks, measures, seq % size, middles, strict=True):
             frozen = self._optics.frozen(frozen, own)
             yield ValidBlock(
-                t_ns=block_middle_ns(block, self._cutter.block_size, self._period_ns),
+                t_ns=middle,
                 index=block.index,
-                slots=block.seq - block.index * self._cutter.block_size,
+                slots=slots,
                 samples=own.samples,
                 means=own.means,
                 mean_sums=own.mean_sums,

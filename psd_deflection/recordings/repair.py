@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
+from msg_adapters import SAMPLES
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder, lock
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.recordings import cdr
 from psd_deflection.recordings.mcap_format import (
     MAGIC,
     Channel,
@@ -42,11 +44,13 @@ _MAX_QOS_TEXT = 10_000
 
 @dataclass(slots=True)
 class RecoveredFile:
-    """One file: its content now; ``repaired``: whether it needed repair; ``warnings`` of the reading."""
+    """One file: its content now; ``repaired``: whether it needed repair; ``span_ns``: duration, by the stamps of the
+    samples where there are any; ``warnings`` of the reading."""
 
     path: Path
     repaired: bool
     count: FileCount
+    span_ns: int
     topics: list[TopicCount]
     warnings: list[str] = field(default_factory=list)
 
@@ -91,6 +95,7 @@ class _Copy:
         self._first: int | None = None
         self.messages = 0
         self.start = self.end = 0
+        self.stamps: tuple[int, int] | None = None
 
     def add(self, record: McapRecord) -> None:
         if isinstance(record, McapMessage):
@@ -116,6 +121,10 @@ class _Copy:
         self.start = min(self.start, m.log_time) if self.messages else m.log_time
         self.end = max(self.end, m.log_time)
         self.messages += 1
+        if channel.topic.endswith(SAMPLES) and len(m.data) >= cdr.FRAME_AT:
+            stamp = cdr.header_stamp_ns(m.data)
+            low, high = self.stamps or (stamp, stamp)
+            self.stamps = (min(low, stamp), max(high, stamp))
         writer = self._writer
         if writer is None:
             return
@@ -149,7 +158,7 @@ class _Copy:
 def _recover_file(path: Path) -> RecoveredFile:
     source = McapReader(path)
     if path.stat().st_size <= len(MAGIC):
-        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), [], source.warnings)
+        return RecoveredFile(path, False, FileCount(path.name, 0, 0, 0), 0, [], source.warnings)
     cut = source.cut_at is not None
     partial = path.with_name(path.name + '.partial')
     partial.unlink(missing_ok=True)
@@ -173,7 +182,8 @@ def _recover_file(path: Path) -> RecoveredFile:
             partial.unlink()
             raise
         partial.rename(path)
-    return RecoveredFile(path, cut, count, list(copy.topics.values()), source.warnings)
+    first, last = copy.stamps or (copy.start, copy.end)
+    return RecoveredFile(path, cut, count, last - first, list(copy.topics.values()), source.warnings)
 
 
 def _set_aside(path: Path) -> Path:

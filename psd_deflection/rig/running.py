@@ -87,6 +87,14 @@ class AcquisitionConfig:
         minimum=0.0,
         maximum=1e7,
     )
+    bag_keep: float = parameter(
+        0.0,
+        's',
+        'files of a recording that ended longer ago are deleted (without bag_max_duration a file has a seventh of '
+        'this); 0: never',
+        minimum=0.0,
+        maximum=1e9,
+    )
     disk_reserve: int = parameter(
         500_000_000,
         'bytes',

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from psd_deflection.base.bounds import MESSAGE_BYTES, BoundedMap, ByteBudget
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.log import ERROR, WARNING, LogCallback
+from psd_deflection.base.log import ERROR, INFO, WARNING, LogCallback
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 from psd_deflection.rig.config import Rig
@@ -312,7 +312,7 @@ class Recorder:
                     rig_values=rig.flat(),
                     device_hello=hello,
                     max_bytes=config.bag_max_bytes,
-                    max_s=config.bag_max_duration,
+                    max_s=config.bag_max_duration or config.bag_keep / 7.0,
                     durable=True,
                     node=self._node,
                 )
@@ -396,14 +396,20 @@ class Recorder:
                 self._make_room(bag, config)
 
     def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:
+        while 0.0 < config.bag_keep < bag.oldest_age_s:
+            self._drop_oldest(bag, f'it ended more than bag_keep = {config.bag_keep:g} s ago')
         while missing := why_full(bag.folder, config.disk_reserve):
             if config.disk_full != 'delete_oldest':
                 raise _FullError(missing)
-            deleted = bag.drop_oldest()
-            if deleted is None:
+            if not self._drop_oldest(bag, f'{missing} (disk_full is delete_oldest)', WARNING):
                 raise _FullError(f'{missing} and there is no older file of this recording to delete')
+
+    def _drop_oldest(self, bag: BagWriter, why: str, level: int = INFO) -> bool:
+        deleted = bag.drop_oldest()
+        if deleted is not None:
             self.files_deleted += 1
-            self._log(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)', WARNING)
+            self._log(f'{deleted}: deleted, {why}', level)
+        return deleted is not None
 
 
 def _require_in_place(bag: BagWriter) -> None:

@@ -45,19 +45,6 @@ class Lasers:
             raise ConfigError(f'apart = {self.apart} m: must be at least -0.005 and at most 0.005')
 
 
-def dots_apart(separation: float, focal: tuple[float, float], between: float | None = None, path: float = 0.0) -> float:
-    """How far apart, m, two parallel beams land that enter a lens ``separation`` apart and leave a second one.
-
-    ``focal``: of the focusing lens and of the collimator; ``between`` the lenses: the sum of both unless given, so
-    that the beams leave parallel. ``path``: from the collimator to the PSD. Thin lenses; below 0: on the other side.
-    """
-    first, second = focal
-    gap = first + second if between is None else between
-    at_second = separation * (1.0 - gap / first)
-    slope = -separation / first - at_second / second
-    return at_second + path * slope
-
-
 class SplitterRule(NamedTuple):
     """One rule. ``value`` and ``limit``: what is compared; ``unit`` of both; ``kept``: whether it holds."""
 

@@ -259,7 +259,7 @@ NOT_OF_A_BLOCK = {
     ('measure/uncertainty/consistency.py', 'survival'): 'told in /diagnostics alone',
     ('measure/uncertainty/vibration.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
     ('measure/pipeline.py', 'zero'): 'what it finds is recorded and not computed again',
-    ('measure/averaging.py', 'block_middle_ns'): 'adds whole numbers',
+    ('measure/averaging.py', 'middles_ns'): 'adds whole numbers',
     ('measure/uncertainty/noise.py', '_autocovariance'): 'adds whole numbers',
     ('measure/health.py', '__init__'): 'a whole number to the power of one',
     ('measure/uncertainty/outliers.py', '__init__'): 'the suspect is told in /diagnostics alone',

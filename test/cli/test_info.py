@@ -21,6 +21,7 @@ from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, FloatArray, ParameterChange, SampleBlock
 from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.declarations import ACQUISITION, MONITOR
 from test.recordings.making import HELLO, STEP, T0, block, write_bag
 
 
@@ -119,13 +120,17 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
 def test_only_recorded_parameters_are_reported_as_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     every = load_rig().flat()
     links = {k: v for k, v in every.items() if k.startswith('link.')}
-    for values, heading in (({**every, 'degraded': 'off'}, 'all'), (links, 'the recorded')):
+    running = {p.name for section in (ACQUISITION, MONITOR) for p in section.parameters.values()}
+    rig = {k: v for k, v in every.items() if k not in running}
+    for values, heading in (({**rig, 'degraded': 'off'}, 'all'), (links, 'the recorded')):
         with BagWriter(tmp_path / heading, rig_values=values) as out:
             out.put(block(0))
+            out.put(ParameterChange(T0, 0, (('state.noise', (0.125,) * 60),)))
         assert main(['info', str(tmp_path / heading)]) == 0
         text = capsys.readouterr().out
         assert f'  {heading} parameters at their defaults' in text
-        assert (f'{len(every) - len(links)} parameters of a rig are not in the recording' in text) == (values is links)
+        assert '0.125' not in text
+        assert (f'{len(rig) - len(links)} parameters of a rig are not in the recording' in text) == (values is links)
 
 
 def test_convert_there_and_back_keeps_every_bit(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

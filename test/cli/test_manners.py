@@ -74,6 +74,7 @@ REJECTED: list[tuple[list[str], int, str]] = [
     (['simulate', '--out', 'a.csv', '--device', 'dataq'], 2, '--device is for a device'),
     (['simulate', '--out', 'a.csv', '--loads', 'constant:0,0,0:0.001'], 2, 'last 1 samples at 1000 Hz'),
     (['simulate', '--out', 'a.csv', '--effect', 'sensor_gain,psd=9'], 2, "psd = '9': must be one of 1, 2"),
+    (['simulate', '--out', 'a.csv', '--effect', 'hum'], 2, 'did you mean mains_interference?'),
     (['discover', CLEAN, '--out', 'found', '--seed', '-1'], 2, '--seed -1'),
     (['discover', CLEAN, '--out', 'found', '--without', 'everything'], 2, 'no effect of that name'),
     (['discover', '--out', 'found'], 2, 'REC: needed: one recording or several; --isolable LOADS needs none'),

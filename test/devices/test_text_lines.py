@@ -127,6 +127,7 @@ def test_garbage_gives_no_sample_and_reading_continues(pieces: list[bytes]) -> N
     assert decoder.feed(b'\n7,7000,0.1,-0.2,5,0,1.5,4.75\n')[-1] == LINE
 
 
+@pytest.mark.foreign
 def test_micros_wraps_and_restarts_with_the_device() -> None:
     extender = TimeExtender()
     got = [

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.measure.averaging import AT_ONCE, BlockCutter, block_middle_ns, measured, of_one_length
+from psd_deflection.measure.averaging import AT_ONCE, BlockCutter, measured, middles_ns, of_one_length
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_start
@@ -87,9 +87,9 @@ def test_however_the_stream_is_cut_the_blocks_are_the_same(seq: list[int], cuts:
 
 @given(st.lists(st.integers(0, 19), unique=True, min_size=1).map(sorted), st.integers(0, 10**6))
 def test_block_middle_is_independent_of_lost_samples(slots: list[int], index: int) -> None:
-    seq = np.array(slots, np.int64) + 20 * index
-    block = SampleBlock(index, seq, seq * 1_000_000, np.zeros((len(seq), 6), np.float32), np.zeros(len(seq), np.uint8))
-    assert block_middle_ns(block, 20, 1e6) == (20 * index) * 1_000_000 + 9_500_000
+    seq = np.array(slots, np.int64) + np.array([[20 * index], [20 * index + 60]])
+    first = 20_000_000 * index + 9_500_000
+    assert middles_ns(seq, seq * 1_000_000, 20, 1e6) == [first, first + 60_000_000]
 
 
 def test_a_repeat_in_the_first_chunk_is_passed_over_too() -> None:
@@ -125,10 +125,9 @@ def test_a_block_of_one_sample_is_complete_with_it() -> None:
 
 def test_the_middle_is_the_mean_of_what_the_clock_reported() -> None:
     """Jitter of ns on some samples, of a block of four of which one is lost: 1.5 periods after its first place."""
-    seq = np.array([8, 9, 11])
-    t_ns = np.array([8_000_000, 9_000_003, 11_000_009])
-    block = SampleBlock(2, seq, t_ns, np.zeros((3, 6), np.float32), np.zeros(3, np.uint8))
-    assert block_middle_ns(block, 4, 1e6) == 9_500_000 + 4
+    seq = np.array([[8, 9, 11]])
+    t_ns = np.array([[8_000_000, 9_000_003, 11_000_009]])
+    assert middles_ns(seq, t_ns, 4, 1e6) == [9_500_000 + 4]
 
 
 BAGS = Path(__file__).parents[2] / 'bags'

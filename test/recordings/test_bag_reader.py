@@ -350,11 +350,11 @@ def information(folder: Path, **changes: object) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.foreign
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'storage_identifier': 'sqlite3'}, 'sqlite3 storage; only mcap is read'),
+        ({'storage_identifier': 'sqlite3'}, 'sqlite3 storage.*`mcap convert IN.db3 OUT.mcap` or `ros2 bag convert`'),
         ({'compression_mode': 'FILE'}, 'compressed by rosbag2'),
         ({'relative_file_paths': []}, 'names no file'),
         ({'relative_file_paths': [3]}, 'names no file'),
@@ -399,6 +399,7 @@ def test_what_is_not_there_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.foreign
 def test_another_type_on_our_topic_is_rejected(tmp_path: Path) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         (m,) = to_messages(TemperatureReading(T0, 20.0))
@@ -601,6 +602,7 @@ def test_of_several_rigs_one_is_chosen(zeroed: Path, tmp_path: Path, capsys: pyt
         next(open_recording(two, namespace='/up').blocks())
 
 
+@pytest.mark.foreign
 def test_remapped_samples_are_found_and_no_foreign_cloud(zeroed: Path, tmp_path: Path) -> None:
     bag = passed_on(zeroed, tmp_path / 'remapped', lambda topic: '/raw/psd/samples' if topic == SAMPLES else topic)
     recording = open_recording(bag)
@@ -629,6 +631,7 @@ def bag(folder: Path, *, storage: str | None = 'mcap', listed: tuple[str, ...] =
     return folder
 
 
+@pytest.mark.foreign
 @pytest.mark.parametrize('storage', ['mcap', '', None])
 def test_a_bag_after_a_reindex_is_read(tmp_path: Path, storage: str | None) -> None:
     recording = open_recording(bag(tmp_path / 'run', storage=storage))
@@ -636,11 +639,7 @@ def test_a_bag_after_a_reindex_is_read(tmp_path: Path, storage: str | None) -> N
     assert recording.warnings == []
 
 
-def test_another_storage_names_both_converters(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r'sqlite3 storage.*`mcap convert IN.db3 OUT.mcap` or `ros2 bag convert`'):
-        open_recording(bag(tmp_path / 'run', storage='sqlite3'))
-
-
+@pytest.mark.foreign
 def test_a_file_that_metadata_do_not_list_is_named(tmp_path: Path) -> None:
     folder = bag(tmp_path / 'run')
     shutil.copy(folder / 'run_0.mcap', folder / 'copy.mcap')
@@ -652,8 +651,11 @@ def test_a_file_that_metadata_do_not_list_is_named(tmp_path: Path) -> None:
     assert open_recording(folder).warnings == []
 
 
+@pytest.mark.foreign
 @pytest.mark.parametrize('leap_s', [-3600.0, 12.0, 1.7e9])
-def test_a_leap_of_log_times_is_reported_once(tmp_path: Path, leap_s: float) -> None:
+def test_a_leap_of_log_times_is_reported_once(
+    tmp_path: Path, leap_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         for record in RECORDS:
             leapt = int(leap_s * 1e9) if record.index >= 20 else 0
@@ -666,3 +668,5 @@ def test_a_leap_of_log_times_is_reported_once(tmp_path: Path, leap_s: float) -> 
     (warning,) = recording.warnings
     assert f"the recorder's clock leapt by {leap_s:+.3f} s" in warning
     assert np.diff(recording.samples['t']).max() < 0.0011
+    assert main(['recover', recording.path.as_posix()]) == 0
+    assert ' 0.780 s; was intact' in capsys.readouterr().out

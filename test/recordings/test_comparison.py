@@ -6,12 +6,14 @@ import platform
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from psd_deflection import __version__
 from psd_deflection.cli.main import main
+from psd_deflection.model.solvers.interface import Solutions
 from psd_deflection.recordings.provenance import NAMES, differences, provenance
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.comparison import agree
@@ -74,8 +76,14 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     """From now on every answer's dX is off by that share."""
     from psd_deflection.model.solvers.exact import ExactSolver
 
-    solve = ExactSolver.solve
-    monkeypatch.setattr(ExactSolver, 'solve', lambda *a: (s := solve(*a))._replace(dx=s.dx * (1.0 + share)))
+    solve_many = ExactSolver.solve_many
+
+    def disturbed_many(*given: Any) -> Solutions:
+        found = solve_many(*given)
+        found.pose[:, 0] *= 1.0 + share
+        return found
+
+    monkeypatch.setattr(ExactSolver, 'solve_many', disturbed_many)
 
 
 OLD = {'psd_deflection': '0.0.9', 'numpy': '1.25.0'}

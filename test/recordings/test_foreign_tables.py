@@ -20,6 +20,8 @@ from psd_deflection.model.simulation.loads import from_csv
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import ReadingsTable, read_references
 
+pytestmark = pytest.mark.foreign
+
 CAMERA = optional('psd_deflection.camera.footage')
 NAMES = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 HEADER = ','.join(('t', *NAMES))

@@ -249,6 +249,7 @@ def test_effects_are_put_into_the_users_file(tmp_path: Path) -> None:
             f'{chr(98 + i)}: &{chr(98 + i)} [{", ".join([f"*{chr(97 + i)}"] * 9)}]' for i in range(6)) + '}\n',
          'aliases stand for more than'),
         ('/**:\n  ros__parameters: {block_size: !!python/object/apply:os.system [ls]}\n', 'malformed YAML'),
+        ('/**:\n  ros__parameters: {device: -0.e1}\n', 'cannot be written again'),
     ],
 )  # fmt: skip
 def test_a_file_that_cannot_be_edited_is_rejected(text: str, why: str, tmp_path: Path) -> None:

@@ -18,22 +18,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped, Vector3Stamped, WrenchStamped
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import qos_profile_sensor_data
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
-from msg_adapters import point_cloud2
+from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.cli.main import main
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.declarations import PARAMETERS
-from test.ros.conftest import BLOCK_NS, stamp
+from psd_deflection.ros.endpoints import publisher_of
+from test.ros.conftest import BLOCK_NS, Peer, stamp
 
 pytestmark = pytest.mark.ros
 
@@ -304,6 +307,15 @@ def test_a_signal_ends_it_after_a_step_of_the_system_clock(
     assert time.monotonic() - began < 8.0
     (folder,) = tmp_path.glob('psd_*')
     assert main(['replay', str(folder), '--compare']) == 0
+
+
+def test_parameters_give_a_topic_the_qos_of_sensor_data(peer: Peer) -> None:
+    wanted = {'reliability': 'best_effort', 'depth': 5}
+    overrides = [Parameter(f'qos_overrides.{SAMPLES}.publisher.{name}', value=v) for name, v in wanted.items()]
+    node = rclpy.create_node('sensor', context=peer.context, parameter_overrides=overrides)
+    got = publisher_of(node, SAMPLES).qos_profile
+    node.destroy_node()
+    assert (got.reliability, got.depth) == (qos_profile_sensor_data.reliability, qos_profile_sensor_data.depth)
 
 
 def test_what_cannot_run_says_why_in_one_line(domain: int, capfd: pytest.CaptureFixture[str]) -> None:

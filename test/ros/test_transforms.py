@@ -4,6 +4,7 @@
 
 import importlib.util
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
@@ -25,6 +26,7 @@ from psd_deflection.ros.running import ros
 from psd_deflection.ros.sinks import TransformPublisher, static_transforms, tip_transform, topics_of
 from psd_deflection.run.processing import RecordSink
 from psd_deflection.run.realtime import Signals, StopRequestedError
+from tools import control_msgs
 
 pytestmark = pytest.mark.ros
 
@@ -114,8 +116,15 @@ def test_the_tip_moves_with_each_primary_estimate_while_active(monkeypatch: pyte
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec('tf2_msgs') is None, reason='tf2_msgs comes with a ROS installation')
-def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer: Any) -> None:
+@pytest.mark.skipif(not (control_msgs.installed('tf2_msgs') or control_msgs.buildable()), reason='needs g++')
+def test_the_node_publishes_the_tree_by_default(
+    start: Callable[..., Any], peer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not control_msgs.installed('tf2_msgs'):
+        # It has no wheel.
+        place = str(control_msgs.built('tf2_msgs'))
+        monkeypatch.syspath_prepend(place)
+        monkeypatch.setenv('PYTHONPATH', os.pathsep.join(filter(None, [place, os.environ.get('PYTHONPATH', '')])))
     from tf2_msgs.msg import TFMessage
 
     start('--ros-args', '-p', 'frame_prefix:=left_')
@@ -125,6 +134,8 @@ def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer:
     peer.until(lambda: len(moving) >= 100 and len(fixed) > 0, 'transforms')
     assert {t.child_frame_id for t in fixed[0].transforms} == {'left_link_tip_rest', 'left_psd_1', 'left_psd_2'}
     assert {t.child_frame_id for m in moving for t in m.transforms} == {'left_link_tip'}
+    for name in [name for name in sys.modules if name.startswith('tf2_msgs')]:
+        del sys.modules[name]
 
 
 @pytest.mark.slow

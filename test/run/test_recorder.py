@@ -204,6 +204,17 @@ def test_the_oldest_file_is_deleted_where_that_was_asked_for(
         assert reader.message_count == module.CHECK_EVERY - 50 + len(list(run.folder.glob('*.mcap')))
 
 
+def test_files_older_than_bag_keep_are_deleted(tmp_path: Path) -> None:
+    run = Run(rig_for(tmp_path, bag_keep=1.39))
+    run.put(module.CHECK_EVERY)
+    assert run.heard().endswith('_0.mcap: deleted, it ended more than bag_keep = 1.39 s ago')
+    run.stop()
+    # Files of ten blocks: a seventh of 1.39 s is just less.
+    assert run.recorder.files_deleted == 18
+    assert run.indices() == list(range(180, module.CHECK_EVERY))
+    assert open_recording(run.folder).warnings == []
+
+
 def test_with_nothing_to_delete_it_ends(tmp_path: Path, disk: Disk) -> None:
     run = Run(rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest'))
     disk.free = 150 * MB

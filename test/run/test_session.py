@@ -40,7 +40,7 @@ class Running:
     def __init__(self, device: ScriptedDevice, sample: Sample, folder: Path) -> None:
         self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
         rig = load_rig(
-            overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'bag_dir': str(folder)}
+            overrides={'port': str(device.link), 'keep_zero': False, 'link.length': 0.5, 'bag_dir': str(folder)}
         )
         self.session = Session(rig, texts(self.logged.put))
         estimates = Estimates(5)

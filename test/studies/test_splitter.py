@@ -12,7 +12,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
 from psd_deflection.records import BlockStatus
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.splitter import Lasers, dots_apart, lit, rules, simulated
+from psd_deflection.studies.splitter import Lasers, lit, rules, simulated
 
 RIG = load_rig()
 FILE = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
@@ -40,16 +40,6 @@ def test_the_numbers_of_the_rules() -> None:
     assert (one.value, two.value, one.limit) == pytest.approx((3.0, 2.0, 1.25))
     assert share.value == pytest.approx(0.4)
     assert spare.value == pytest.approx(5.0 / 1.5)
-
-
-def test_two_lenses_leave_two_parallel_beams_apart() -> None:
-    """Separation times the ratio of the focal lengths, on the other side; nothing there makes them one."""
-    assert dots_apart(0.010, (0.100, 0.010), path=0.585) == pytest.approx(-1e-3)
-    # Where they cross, at the first focus, the collimator has no hold on them: a path of f1 has them apart as before.
-    assert dots_apart(0.010, (0.100, 0.010), between=0.100) == pytest.approx(0.0, abs=1e-15)
-    assert dots_apart(0.010, (0.100, 0.010), between=0.100, path=0.100) == pytest.approx(-0.010)
-    # In touch they are one lens of 1/f1 + 1/f2: the beams cross at its focus.
-    assert dots_apart(0.010, (0.100, 0.025), between=0.0, path=0.020) == pytest.approx(0.0, abs=1e-15)
 
 
 def test_failed_laser_costs_certainty_or_warm_up() -> None:

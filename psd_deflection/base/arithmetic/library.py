@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.base.arithmetic.matrices import AnyFloats, pivots
+from psd_deflection.base.arithmetic.matrices import AnyFloats, has_factors, pivots
 from psd_deflection.records import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -147,11 +147,7 @@ class Arithmetic:
 
     def is_positive(self, a: FloatArray) -> bool:
         """Whether symmetric ``a`` (n, n) is positive definite."""
-        try:
-            np.linalg.cholesky(a)
-        except np.linalg.LinAlgError:
-            return False
-        return True
+        return has_factors(a)
 
     def legendre(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Nodes and weights of Gauss and Legendre's rule over -1 to 1."""

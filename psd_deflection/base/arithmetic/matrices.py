@@ -158,12 +158,13 @@ def surely_positive(a: FloatArray) -> bool | None:
     for more, answer in ((-margin, True), (margin, False)):
         moved = np.array(a, dtype=np.float64)
         moved[range(size), range(size)] += more
-        if _has_factors(moved) is answer:
+        if has_factors(moved) is answer:
             return answer
     return None
 
 
-def _has_factors(a: FloatArray) -> bool:
+def has_factors(a: FloatArray) -> bool:
+    """Whether Cholesky factors symmetric ``a`` (n, n), up to rounding: it is positive definite."""
     try:
         np.linalg.cholesky(a)
     except np.linalg.LinAlgError:

@@ -33,6 +33,7 @@ from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.summary import summary
 from psd_deflection.recordings.write.parquet import ERROR, Field, ParquetFile
 from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.declarations import ACQUISITION, MONITOR
 
 FIELDS = (
     ERROR,
@@ -222,7 +223,9 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
 
 def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
     out: list[str] = []
-    unknown = len(set(load_rig().flat()).difference(found['parameters'])) if found['parameters'] else 0
+    # What says how a node runs describes no rig.
+    running = {p.name for section in (ACQUISITION, MONITOR) for p in section.parameters.values()}
+    unknown = len(load_rig().flat().keys() - running - found['parameters'].keys()) if found['parameters'] else 0
     if found['parameters'] and not found['changed_parameters']:
         out.append(f'  {"the recorded" if unknown else "all"} parameters at their defaults')
     elif found['parameters']:

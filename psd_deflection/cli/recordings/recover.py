@@ -52,6 +52,7 @@ def in_json(done: Recovered) -> dict[str, Any]:
                 'messages': file.count.messages,
                 'start_ns': file.count.start_ns,
                 'end_ns': file.count.end_ns,
+                'span_s': file.span_ns * 1e-9,
                 'warnings': file.warnings,
             }
             for file in done.files
@@ -63,9 +64,8 @@ def in_json(done: Recovered) -> dict[str, Any]:
 
 def _lines(path: str, done: Recovered) -> Iterator[str]:
     for file in done.files:
-        span = (file.count.end_ns - file.count.start_ns) * 1e-9
         what = f'repaired, the old one is {file.path.name}.cut' if file.repaired else 'was intact'
-        yield f'{file.path}: {file.count.messages} messages, {span:.3f} s; {what}'
+        yield f'{file.path}: {file.count.messages} messages, {file.span_ns * 1e-9:.3f} s; {what}'
     for aside in done.set_aside:
         yield f'{aside}: held nothing and is set aside'
     if done.metadata_written:

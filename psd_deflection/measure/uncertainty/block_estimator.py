@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.measure.state import State, Value, mismatch, numbers
-from psd_deflection.measure.uncertainty.block_fit import Fitted
+from psd_deflection.measure.uncertainty.block_fit import FittedRun
 from psd_deflection.measure.uncertainty.combinations import Residual
 from psd_deflection.measure.uncertainty.consistency import UNMEASURED, ConsistencyResult, Unexplained, survival
 from psd_deflection.measure.uncertainty.noise import StreamNoise
@@ -218,14 +218,14 @@ class BlockEstimator:
                 own.load_state(self._pending.pop(psds))
         return own
 
-    def fits(self, psds: PsdSet, slots: IntArray, samples: FloatArray) -> Iterator[Fitted]:
-        """Yield the dots of ``psds`` at the middle of each block.
+    def fits(self, psds: PsdSet, slots: IntArray, samples: FloatArray) -> Iterator[tuple[FittedRun, int]]:
+        """Yield the fit of ``psds`` for each block: the run that it was computed with, and its place there.
 
         ``slots`` (n,): which samples are present; ``samples`` (B, n, 2P), m, of all PSDs.
         """
-        for fitted in psds.fits(slots, samples):
-            self.misfits += fitted.misfit
-            yield fitted
+        for run, at in psds.fits(slots, samples):
+            self.misfits += run.misfit[at]
+            yield run, at
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
         """Return the variances (C,), m^2, of the mean of so many samples of each reading."""

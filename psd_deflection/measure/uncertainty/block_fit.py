@@ -79,6 +79,19 @@ class Fitted(NamedTuple):
     misfit: bool
 
 
+class FittedRun(NamedTuple):
+    """B blocks that were fitted together: ``dots``, ``covariance`` (B, C, C), ``misfit`` of each as of
+    :class:`Fitted`."""
+
+    dots: list[tuple[float, ...]]
+    covariance: FloatArray
+    misfit: list[bool]
+
+    def block(self, at: int) -> Fitted:
+        """The fit of block ``at`` (from 0)."""
+        return Fitted(self.dots[at], self.covariance[at], self.misfit[at])
+
+
 def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
     """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples.
 
@@ -236,12 +249,14 @@ class BlockFit:
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
         """The dots at the middle of one block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
-        return next(self.fits(slots, dots[None]))
+        run, at = next(self.fits(slots, dots[None]))
+        return run.block(at)
 
-    def fits(self, slots: IntArray, dots: FloatArray) -> Iterator[Fitted]:
-        """The dots at the middle of each of B blocks. ``slots`` (n,): which samples they have. ``dots`` (B, n, C), m.
+    def fits(self, slots: IntArray, dots: FloatArray) -> Iterator[tuple[FittedRun, int]]:
+        """The fit of each of B blocks: the run that it was computed with, and its place there.
 
-        The state is that after the block that was taken last. Noise that is set in between counts from the next one.
+        ``slots`` (n,): which samples the blocks have. ``dots`` (B, n, C), m. The state is that after the block that was
+        taken last. Noise that is set in between counts from the next one.
         """
         full = len(slots) == self._size
         # Sums over more numbers than that take another order.
@@ -249,14 +264,15 @@ class BlockFit:
         at = 0
         while at < len(dots):
             terms = self._full
-            for memory, fitted in self._together(slots, dots[at : at + most]):
+            memories, run = self._together(slots, dots[at : at + most])
+            for i, memory in enumerate(memories):
                 self._memory = memory
                 at += 1
-                yield fitted
+                yield run, i
                 if self._full is not terms:
                     break
 
-    def _together(self, slots: IntArray, dots: FloatArray) -> Iterator[tuple[_Memory, Fitted]]:
+    def _together(self, slots: IntArray, dots: FloatArray) -> tuple[Sequence[_Memory], FittedRun]:
         """The memory after each block and its fit, as far as the present noise holds."""
         xp, count = self._xp, self._count
         blocks, samples, _ = dots.shape
@@ -294,7 +310,7 @@ class BlockFit:
         for vibration in self._vibrations:
             covariance += self._residual_of(vibration, x, weights)
         rows, covariance = self._combinations.back(value, covariance)
-        return zip(memories, map(Fitted, map(tuple, rows.tolist()), covariance, misfit), strict=True)
+        return memories, FittedRun(list(map(tuple, rows.tolist())), covariance, misfit)
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""

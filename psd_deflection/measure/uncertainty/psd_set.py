@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
-from psd_deflection.measure.uncertainty.block_fit import BlockFit, Fitted
+from psd_deflection.measure.uncertainty.block_fit import BlockFit, FittedRun
 from psd_deflection.measure.uncertainty.consistency import (
     BaseLineExcess,
     ConsistencyCheck,
@@ -100,8 +100,8 @@ class PsdSet:
         own = np.ix_(self.columns, self.columns)
         self.fit.set_noise(noise.gamma[own], [Tone(t.frequency, t.covariance[own]) for t in noise.tones])
 
-    def fits(self, slots: IntArray, samples: FloatArray) -> Iterator[Fitted]:
-        """Fit blocks in turn: their places ``slots`` (n,) and the ``samples`` (B, n, 2P) m of all PSDs."""
+    def fits(self, slots: IntArray, samples: FloatArray) -> Iterator[tuple[FittedRun, int]]:
+        """Fit blocks in turn, as :meth:`BlockFit.fits`; ``samples`` (B, n, 2P), m, of all PSDs."""
         return self.fit.fits(slots, samples if self.is_full else samples[:, :, self.columns])
 
     def unexplained(

@@ -185,7 +185,8 @@ class Effect:
     ``uses``: inputs of the correction besides dots and sums. ``order``: among the effects of one
     stage. ``finite``: the signature at the nominal value vanishes, so exactly the values of
     ``grid`` are probed. ``full``: ``apply`` must see the whole history at once, because a sample depends on later
-    ones; no effect of the catalogue does.
+    ones; no effect of the catalogue does. ``ahead``: of how many later samples it takes a reading; the last load then
+    stays.
 
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
@@ -216,6 +217,7 @@ class Effect:
     least_psds: int = 2
     also: tuple[str, ...] = ()
     further: tuple[Effect, ...] = ()
+    ahead: Callable[[Physics, Values], int] | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:

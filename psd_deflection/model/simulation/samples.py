@@ -3,7 +3,8 @@
 """Consecutive samples on their way through the stages."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import Self
 
 import numpy as np
 
@@ -47,3 +48,11 @@ class SimulatedSamples:
     volts: FloatArray = field(default_factory=_none)
     noise: FloatArray = field(default_factory=lambda: np.zeros(6))
     between: Callable[[float], FloatArray] = no_samples_between
+
+    def first(self, n: int) -> Self:
+        """The first ``n`` samples, all of whose quantities are there."""
+        out = replace(self)
+        for name in (f.name for f in fields(self) if f.name != 'noise'):
+            if isinstance(rows := getattr(self, name), np.ndarray):
+                setattr(out, name, rows[..., :n])
+        return out

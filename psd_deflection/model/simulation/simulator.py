@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, State
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
@@ -41,7 +42,8 @@ class ForwardModel:
     """The stages without noise and converter; keeps its state between calls.
 
     ``effects``: the active effects; by default those of the rig file. ``phase``: quantities are taken this
-    long after each sample, s. ``settled``: the link comes to rest under each load before it is read.
+    long after each sample, s. ``settled``: the link comes to rest under each load before it is read. ``ahead``: of how
+    many later samples one takes a reading; a history is then simulated at once.
     """
 
     def __init__(
@@ -57,6 +59,9 @@ class ForwardModel:
             if active.effect.configure is not None:
                 active.effect.configure(self.physics, active.values)
         p = self.physics
+        ahead = [a.effect.ahead(p, a.values) for a in self.effects if a.effect.ahead is not None]
+        # Between samples an effect asks for the readings of its own PSD alone.
+        self.ahead = max(ahead, default=0) if phase == 0.0 else 0
         bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, phase)
         torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period, phase)
         self._at_rest = p.at_rest
@@ -73,8 +78,22 @@ class ForwardModel:
     def run(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedSamples:
         """The next n samples, up to the amplifier's volts: ``loads`` (n, 3) N, N, N m.
 
-        ``temperature`` (n,), degrees Celsius; None is a steady one.
+        ``temperature`` (n,), degrees Celsius; None is a steady one. Raises ConfigError for a second call if an effect
+        looks ahead.
         """
+        if self.ahead and len(loads):
+            if self._count:
+                raise ConfigError(
+                    'effects: a PSD that is early is simulated with all loads at once; a running rig has none'
+                )
+            n = len(loads)
+            loads = np.concatenate((loads, np.repeat(loads[-1:], self.ahead, axis=0)))
+            if temperature is not None:
+                temperature = np.concatenate((temperature, np.repeat(temperature[-1:], self.ahead)))
+            return self._run(loads, temperature).first(n)
+        return self._run(loads, temperature)
+
+    def _run(self, loads: FloatArray, temperature: FloatArray | None) -> SimulatedSamples:
         n = len(loads)
         p = self.physics
         warmer = np.zeros(n)
@@ -159,7 +178,7 @@ class ForwardModel:
         in the processor's cache.
         """
         n = len(loads)
-        size = n if any(active.effect.full for active in self.effects) else max(1, PIECE // unit) * unit
+        size = n if self.ahead or any(active.effect.full for active in self.effects) else max(1, PIECE // unit) * unit
         for first in range(0, n, max(1, size)):
             at = slice(first, min(first + size, n))
             yield at, self.expect(loads[at], None if temperature is None else temperature[at]).volts
@@ -180,7 +199,7 @@ class RigSimulator:
 
     The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps. ``rig`` is the true one:
     its wiring says which channel a detector's volts really are on. Raises ConfigError if the rig contradicts itself
-    about where the PSDs are.
+    about where the PSDs are. ``ahead``: as of :class:`ForwardModel`.
     """
 
     def __init__(self, rig: Rig, seed: int = 0) -> None:
@@ -188,6 +207,7 @@ class RigSimulator:
         self._model = ForwardModel(rig)
         self._noise = np.random.default_rng(seed)
         self._wiring = Wiring.from_rig(rig)
+        self.ahead = self._model.ahead
 
     def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedStep:
         """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.

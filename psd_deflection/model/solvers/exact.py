@@ -27,7 +27,7 @@ from psd_deflection.base.arithmetic import Arithmetic
 from psd_deflection.base.errors import SolverError
 from psd_deflection.model.plate.layout import Geometry, check_twist
 from psd_deflection.model.plate.plate import Number
-from psd_deflection.model.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain
+from psd_deflection.model.solvers.interface import Solution, Solutions, Solver, SolverStatus, flat_gain, flat_gain_many
 from psd_deflection.model.solvers.plane import Four, Nine, checked_variances, turn_covariance
 from psd_deflection.records import FloatArray
 
@@ -80,11 +80,16 @@ class ExactSolver(Solver):
         qy = q1y - self._c2y - y2
         lx = l1x - self._l2x
         ly = l1y - self._l2y
-        theta = xp.atan2(qx * ly - qy * lx, qx * lx + qy * ly)
-        c, s = xp.cos_sin(theta)
+        across = qx * ly - qy * lx
+        along = qx * lx + qy * ly
+        theta = xp.atan2(across, along)
         steps = 0
         status = SolverStatus.OK
-        if mx != my:
+        if mx == my:
+            # cos and sin of the arctangent with one square root.
+            size = xp.hypot(along, across)
+            c, s = (along / size, across / size) if size != 0.0 else (1.0, 0.0)
+        else:
             theta, c, s, steps = _newton(
                 theta,
                 (mx - my) * (ly * ly - lx * lx),
@@ -174,6 +179,10 @@ class ExactSolver(Solver):
         """In closed form. See :class:`Solver`."""
         return flat_gain(self._places, dots, variances, solution, self._xp)
 
+    def gain_many(self, dots: FloatArray, variances: tuple[float, ...], solutions: Solutions) -> FloatArray:
+        """In closed form. See :class:`Solver`."""
+        return flat_gain_many(self._places, dots, variances, solutions, self._xp)
+
     def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
         """N blocks; vectorised for two PSDs. See :class:`Solver`."""
         if self._count != 2:
@@ -203,15 +212,14 @@ class ExactSolver(Solver):
         across = qx * ly - qy * lx
         along = qx * lx + qy * ly
         theta = xp.atan2_many(across, along)
-        if (mx == my).all():
-            converged = np.isfinite(theta)
-            # cos and sin of the arctangent with one square root.
-            size = xp.hypot_many(along, across)
-            with np.errstate(invalid='ignore'):
-                c = np.where(size != 0.0, along / size, 1.0)
-                s = np.where(size != 0.0, across / size, 0.0)
-        else:
-            theta, converged = _newton_many(
+        converged = np.isfinite(theta)
+        size = xp.hypot_many(along, across)
+        with np.errstate(invalid='ignore'):
+            c = np.where(size != 0.0, along / size, 1.0)
+            s = np.where(size != 0.0, across / size, 0.0)
+        same = mx == my
+        if not same.all():
+            rotated, ended = _newton_many(
                 theta,
                 (mx - my) * (ly * ly - lx * lx),
                 (mx - my) * lx * ly,
@@ -219,8 +227,8 @@ class ExactSolver(Solver):
                 mx * qx * ly - my * qy * lx,
                 xp,
             )
-            c = xp.cos_many(theta)
-            s = xp.sin_many(theta)
+            theta, converged = np.where(same, theta, rotated), np.where(same, converged, ended)
+            c, s = np.where(same, c, xp.cos_many(rotated)), np.where(same, s, xp.sin_many(rotated))
         dx, dy, residual, covariance = self._answer(c, s, (q1x, q1y, qx, qy), (mx, my), tuple(v.T))
         for where, values in (
             (out.pose, (dx, dy, theta)),

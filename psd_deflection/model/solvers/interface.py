@@ -13,6 +13,7 @@ per call would dominate. ``solve_many`` takes and returns arrays of n blocks.
 """
 
 import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -22,10 +23,13 @@ import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.model.plate.layout import Geometry
-from psd_deflection.model.plate.plate import Tilts
+from psd_deflection.model.plate.plate import Number, Tilts
 from psd_deflection.model.solvers.plane import Covariance, checked_variances
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
+
+Columns = FloatArray | float
+BoolArray = npt.NDArray[np.bool_]
 
 _STEP = 1e-8
 """m. Of differences: far above rounding, far below what bends the answer."""
@@ -62,6 +66,9 @@ class Solution(NamedTuple):
     iterations: int
 
 
+_STATUSES = tuple(SolverStatus)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Solutions:
     """The answers of n blocks.
@@ -76,6 +83,29 @@ class Solutions:
     residual: FloatArray
     status: npt.NDArray[np.int8]
 
+    def rows(self) -> list[Solution]:
+        """Each block's answer; its iterations are not counted."""
+        arrays = self.pose, self.tilt, self.covariance.reshape(-1, 9), self.residual, self.status
+        return [
+            Solution(x, y, theta, phi, omega, tuple(covariance), tuple(residual), _STATUSES[status], 0)
+            for (x, y, theta), (phi, omega), covariance, residual, status in zip(
+                *[array.tolist() for array in arrays], strict=True
+            )
+        ]
+
+
+def flat_solutions(
+    pose: Sequence[FloatArray], covariance: Sequence[Columns], residual: Sequence[FloatArray], converged: BoolArray
+) -> Solutions:
+    """The answers of n blocks without tilts, of columns (n,): 3 of the pose, 9 of the covariance, 2P of the residual.
+
+    ``converged`` (n,): the others have NOT_CONVERGED.
+    """
+    n = len(converged)
+    covariances = np.stack([np.broadcast_to(column, n) for column in covariance], axis=1).reshape(n, 3, 3)
+    status = np.where(converged, SolverStatus.OK, SolverStatus.NOT_CONVERGED).astype(np.int8)
+    return Solutions(np.stack(pose, axis=1), np.zeros((n, 2)), covariances, np.stack(residual, axis=1), status)
+
 
 class Solver(abc.ABC):
     """One method, bound to one geometry; holds no state between blocks.
@@ -89,6 +119,12 @@ class Solver(abc.ABC):
     budgeted_as: ClassVar[str]
     psds_at: ClassVar[Literal['tip', 'base']] = 'tip'
     tilts: ClassVar[Tilts] = 'none'
+
+    def __init_subclass__(cls) -> None:
+        # A method derived from another one that changes the answer of one block changes that of many.
+        for one, many in (('solve', 'solve_many'), ('gain', 'gain_many')):
+            if one in vars(cls) and many not in vars(cls):
+                setattr(cls, many, getattr(Solver, many))
 
     @abc.abstractmethod
     def __init__(self, geometry: Geometry) -> None:
@@ -137,6 +173,11 @@ class Solver(abc.ABC):
             out[2, i] = (moved.theta - solution.theta) / _STEP
         return out
 
+    def gain_many(self, dots: FloatArray, variances: tuple[float, ...], solutions: Solutions) -> FloatArray:
+        """:meth:`gain` (n, 3, 2P) of n blocks: ``dots`` (n, 2P) m, ``variances`` (2P,) m^2 of all of them."""
+        rows = zip(dots.tolist(), solutions.rows(), strict=True)
+        return np.stack([self.gain(tuple(own), variances, solution) for own, solution in rows])
+
     def allowance(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> FloatArray | None:
         """(3, 3): what the covariance of :meth:`solve` holds besides the dots' noise; None if there is nothing."""
         del dots, variances
@@ -151,28 +192,40 @@ def flat_gain(
     arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
     """:meth:`Solver.gain` of weighted least squares on a flat plate. ``centers``: (x1, y1, x2, y2, ...), m."""
-    points = tuple([center + dot for center, dot in zip(centers, dots, strict=True)])
-    return weighted_gain(points, solution.theta, variances, solution.covariance, arithmetic)
+    points = [center + dot for center, dot in zip(centers, dots, strict=True)]
+    return np.array(weighted_gain(points, arithmetic.cos_sin(solution.theta), variances, solution.covariance))
+
+
+def flat_gain_many(
+    centers: tuple[float, ...],
+    dots: FloatArray,
+    variances: tuple[float, ...],
+    solutions: Solutions,
+    arithmetic: Arithmetic = LIBRARY,
+) -> FloatArray:
+    """:meth:`Solver.gain_many`, as :func:`flat_gain`."""
+    points = [center + column for center, column in zip(centers, dots.T, strict=True)]
+    theta = solutions.pose[:, 2]
+    turn = arithmetic.cos_many(theta), arithmetic.sin_many(theta)
+    rows = weighted_gain(points, turn, variances, tuple(solutions.covariance.reshape(-1, 9).T))
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def weighted_gain(
-    points: tuple[float, ...],
-    theta: float,
-    variances: tuple[float, ...],
-    covariance: Covariance,
-    arithmetic: Arithmetic = LIBRARY,
-) -> FloatArray:
+    points: Sequence[Number], turn: tuple[Number, Number], variances: Sequence[float], covariance: Sequence[Number]
+) -> tuple[list[Number], list[Number], list[Number]]:
     """P A^T V^-1, P the answer's own ``covariance``: the gain of least squares with the weights 1/``variances``.
 
-    ``points``: q = (x1, y1, ...), m. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
+    Rows of dX, dY, theta, of one block or of arrays of blocks. ``points``: q = (x1, y1, ...), m. ``turn``: cosine and
+    sine of theta. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
     """
-    c, s = arithmetic.cos_sin(theta)
+    c, s = turn
     xx, xy, xt, _, yy, yt, _, _, tt = covariance
-    rows: tuple[list[float], list[float], list[float]] = ([], [], [])
+    rows: tuple[list[Number], list[Number], list[Number]] = ([], [], [])
     for i in range(0, len(points), 2):
         qx, qy = points[i], points[i + 1]
         for ax, ay, at, v in ((-c, -s, qy, variances[i]), (s, -c, -qx, variances[i + 1])):
             rows[0].append((xx * ax + xy * ay + xt * at) / v)
             rows[1].append((xy * ax + yy * ay + yt * at) / v)
             rows[2].append((xt * ax + yt * ay + tt * at) / v)
-    return np.array(rows)
+    return rows

@@ -15,6 +15,7 @@ no matrix is inverted. The linear model still leaves d unrotated; ``wls_exact`` 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -23,8 +24,17 @@ from psd_deflection.base.arithmetic import Arithmetic
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate.layout import Geometry, check_twist
 from psd_deflection.model.plate.linear import design_matrix
+from psd_deflection.model.plate.plate import Number
 from psd_deflection.model.solvers.fixed_gain import FixedGain
-from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus, weighted_gain
+from psd_deflection.model.solvers.interface import (
+    Solution,
+    Solutions,
+    Solver,
+    SolverStatus,
+    flat_solutions,
+    weighted_gain,
+)
+from psd_deflection.model.solvers.plane import checked_variances
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 
@@ -82,43 +92,51 @@ class WlsSolver(Solver):
         if self._fixed is not None:
             return self._fixed.solve(dots, variances)
         known = self._weighted(variances)
-        shift_x = shift_y = 0.0
+        (dx, dy, theta), residual = self._answer(dots, known)
+        status = SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED
+        return Solution(dx, dy, theta, 0.0, 0.0, known.covariance, tuple(residual), status, 0)
+
+    def solve_many(self, dots: FloatArray, variances: FloatArray) -> Solutions:
+        """N blocks, together if all have the same variances. See :class:`Solver`."""
+        v = checked_variances(variances)
+        if self._fixed is not None or len(v) > 1:
+            return super().solve_many(dots, v)
+        known = self._weighted(tuple(v[0].tolist()))
+        pose, residual = self._answer(list(np.atleast_2d(np.asarray(dots, dtype=np.float64)).T), known)
+        return flat_solutions(pose, known.covariance, residual, np.isfinite(pose[2]))
+
+    def _answer(self, dots: Sequence[Number], known: _Weighted) -> tuple[tuple[Number, Number, Number], list[Number]]:
+        """dX, dY, theta and the residual of one block, or of arrays of blocks."""
+        shift_x = shift_y = moment = 0.0 * dots[0]
         terms = []
         for i, ((lx, ly, x0, y0), (wx, wy)) in enumerate(zip(self._rows, known.weights, strict=True)):
             bx = dots[2 * i] - x0
             by = dots[2 * i + 1] - y0
-            shift_x += wx * bx
-            shift_y += wy * by
+            shift_x = shift_x + wx * bx
+            shift_y = shift_y + wy * by
             terms.append((bx, by, lx, ly))
-        shift_x /= known.sum_x
-        shift_y /= known.sum_y
-        moment = 0.0
         for (bx, by, _, _), (wx_ty, wy_tx) in zip(terms, known.levers, strict=True):
-            moment += wx_ty * bx - wy_tx * by
+            moment = moment + (wx_ty * bx - wy_tx * by)
         theta = moment * known.variance
-        dx = known.mean_y * theta - shift_x
-        dy = -known.mean_x * theta - shift_y
-        residual: list[float] = []
+        dx = known.mean_y * theta - shift_x / known.sum_x
+        dy = -known.mean_x * theta - shift_y / known.sum_y
+        residual: list[Number] = []
         for bx, by, lx, ly in terms:
             residual.append(bx + dx - ly * theta)
             residual.append(by + dy + lx * theta)
-        return Solution(
-            dx,
-            dy,
-            theta,
-            0.0,
-            0.0,
-            known.covariance,
-            tuple(residual),
-            SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED,
-            0,
-        )
+        return (dx, dy, theta), residual
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """In closed form: that of the beams' places without twist. See :class:`Solver`."""
         if self._fixed is not None:
             return self._fixed.gain(dots, variances, solution)
         return self._weighted(variances).gain
+
+    def gain_many(self, dots: FloatArray, variances: tuple[float, ...], solutions: Solutions) -> FloatArray:
+        """The same for all blocks. See :class:`Solver`."""
+        if self._fixed is not None:
+            return super().gain_many(dots, variances, solutions)
+        return np.broadcast_to(self._weighted(variances).gain, (len(dots), 3, dots.shape[1]))
 
     def _weighted(self, variances: tuple[float, ...]) -> _Weighted:
         known = self._known
@@ -170,7 +188,7 @@ class _Weighted:
     def gain(self) -> FloatArray:
         """See :class:`Solver`."""
         places = tuple([place for lx, ly, _, _ in self._rows for place in (lx, ly)])
-        out = weighted_gain(places, 0.0, self.variances, self.covariance, self._xp)
+        out = np.array(weighted_gain(places, self._xp.cos_sin(0.0), self.variances, self.covariance))
         # Every block gets this one.
         out.setflags(write=False)
         return out

@@ -202,18 +202,22 @@ _RATE_ROWS = 10_000
 class CsvRecording(Recording):
     """An opened CSV. ``sample_rate_hz``: if known; otherwise computed from the rows' times.
 
+    ``part``: it may lack some PSDs, which another logger recorded. ``channels``: those that it has, of PSD after PSD.
     Raises RecordingError naming file, line and column of a fault.
     """
 
     temperatures_held = True
 
-    def __init__(self, path: Path, block_size: int | None = None, sample_rate_hz: float | None = None) -> None:
+    def __init__(
+        self, path: Path, block_size: int | None = None, sample_rate_hz: float | None = None, *, part: bool = False
+    ) -> None:
         super().__init__(path, block_size)
         self._warnings: list[str] = []
         self._source = SampleRows(self.path)
         self._reject = self._source.reject
-        self._columns = self._read_header()
-        self._channels = channel_names(self.psds)
+        self.channels = tuple(c for c in channel_names(MOST_PSDS) if c in self._source.columns)
+        self._columns = self._read_header(part)
+        self.psds = len(self.channels) // 3
         self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
         self.sample_rate_hz = 1e9 / self._step_ns
 
@@ -227,14 +231,21 @@ class CsvRecording(Recording):
         """Columns that are not read."""
         return self._warnings
 
-    def _read_header(self) -> dict[str, int]:
+    def _read_header(self, part: bool) -> dict[str, int]:
         names, number, columns = self._source.header, self._source.header_line, self._source.columns
-        form = f'a recording begins with {",".join(REQUIRED)}'
-        if 't' not in columns and ('mass' in columns or LOAD_COLUMNS[0] in columns):
+        form, required = f'a recording begins with {",".join(REQUIRED)}', REQUIRED
+        if part:
+            first = int(self.channels[0][-1]) if self.channels else 1
+            required = ('t', *channel_names(first)[-3:])
+            form = "one logger's part of a recording begins with t and x, y and sum of a PSD"
+        elif 't' in columns and self.channels:
+            form += '; `psd-deflection convert FIRST.csv SECOND.csv --out OUT` joins the parts of two loggers'
+        elif 'mass' in columns or LOAD_COLUMNS[0] in columns:
             form += '; discover and info take a table of readings without times'
-        self._source.require(REQUIRED, form, [name for name in KNOWN if name not in REQUIRED])
+        self._source.require(required, form, [name for name in KNOWN if name not in required])
         self._reject_parts(columns, number)
-        self.psds = self._count_psds(columns, number)
+        if not part:
+            self._reject_gap(number)
         unknown = [n for n in names if n not in KNOWN]
         if unknown:
             self._warnings.append(f'{self.path}:{number}: columns that are not read: {", ".join(unknown)}')
@@ -242,20 +253,18 @@ class CsvRecording(Recording):
 
     def _reject_parts(self, columns: Collection[str], number: int) -> None:
         """Reject a header with a part of a group."""
-        for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
+        psds = (channel_names(n)[-3:] for n in range(1, MOST_PSDS + 1))
+        for group in (LOAD_COLUMNS, REFERENCE_COLUMNS, *psds):
             there = [n for n in group if n in columns]
             if there and len(there) < len(group):
                 lacking = ', '.join(n for n in group if n not in columns)
                 raise self._reject(f'has {", ".join(there)} without {lacking}', number)
 
-    def _count_psds(self, columns: Collection[str], line: int) -> int:
-        """PSDs of which there are columns, 2 or more; none may be left out, and none in part."""
-        further = [name for name in channel_names(MOST_PSDS)[6:] if name in columns]
-        psds = int(further[-1].lstrip('xysum')) if further else 2
-        lacking = [name for name in channel_names(psds) if name not in columns]
+    def _reject_gap(self, number: int) -> None:
+        """Reject a header that lacks a PSD before the last."""
+        lacking = [name for name in channel_names(int(self.channels[-1][-1])) if name not in self.channels]
         if lacking:
-            raise self._reject(f'has {", ".join(further)} without {", ".join(lacking)}', line)
-        return psds
+            raise self._reject(f'has {", ".join(self.channels[6:])} without {", ".join(lacking)}', number)
 
     def _number(self, cells: list[str], name: str, line: int, largest: float = math.inf) -> float:
         cell = cells[self._columns[name]].strip()
@@ -314,15 +323,15 @@ class CsvRecording(Recording):
 
     def _chunk(self, rows: CsvRows, seqs: list[int]) -> Iterator[RawChunk]:
         """One chunk of ``rows``. Before it raises RecordingError, one of those before the bad row."""
-        width, channels = len(self._source.header), len(self._channels)
-        volts = _floats([rows.cells[self._columns[c] :: width] for c in self._channels])
+        width, channels = len(self._source.header), len(self.channels)
+        volts = _floats([rows.cells[self._columns[c] :: width] for c in self.channels])
         bad: RecordingError | None = None
         if not (np.abs(volts) <= MAX_VOLTS).all():
             good: list[list[float]] = []
             try:
                 for i, line in enumerate(rows.lines):
                     row = rows.cells[i * width : (i + 1) * width]
-                    good.append([self._number(row, c, line, MAX_VOLTS) for c in self._channels])
+                    good.append([self._number(row, c, line, MAX_VOLTS) for c in self.channels])
             except RecordingError as error:
                 bad = error
             volts = np.array(good, dtype=np.float64).reshape(-1, channels)

@@ -28,7 +28,6 @@ from psd_deflection.records import (
     KNOWN_LOAD,
     DeflectionEstimate,
     ParameterChange,
-    RawChunk,
     Record,
     SampleBlock,
     TipLoad,
@@ -148,14 +147,10 @@ def _steps(
 
 def _processed(pipeline: Pipeline, waiting: list[SampleBlock]) -> Iterator[list[Record]]:
     """The records of the blocks that wait, block by block; none waits any more."""
-    if not waiting:
-        return
-    columns = zip(*[(b.seq, b.t_ns, b.volts, b.flags) for b in waiting], strict=True)
-    seq, t_ns, volts, flags = (np.concatenate(column) for column in columns)
-    chunk = RawChunk(seq, t_ns, volts, flags)
+    blocks = waiting.copy()
     waiting.clear()
     records: list[Record] = []
-    for record in pipeline.process(chunk):
+    for record in pipeline.process_blocks(blocks):
         records.append(record)
         if isinstance(record, SampleBlock):
             yield records

@@ -10,7 +10,7 @@ import numpy as np
 
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.detector import counts_to_volts
-from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.model.simulation.simulator import RigSimulator, SimulatedStep
 from psd_deflection.recordings.in_memory import RecordingInMemory
 from psd_deflection.records import (
     AppliedLoad,
@@ -101,6 +101,7 @@ class SimulatedRun:
         block = rig.estimator.block_size
         # A temperature takes effect with the next block, so process block by block.
         size = max(1, round(CHUNK_SECONDS * rig.converter.sample_rate_hz)) if temperature is None else block
+        made = simulator.step(loads, temperature) if simulator.ahead else None
         last: tuple[float, ...] | None = None
         last_temperature: float | None = None
         for start in range(0, len(loads), size):
@@ -122,7 +123,10 @@ class SimulatedRun:
                     warmer = pipeline.temperature(last_temperature)
                     if warmer is not None:
                         yield warmer
-            part = simulator.step(loads[start:stop], None if temperature is None else temperature[start:stop])
+            if made is None:
+                part = simulator.step(loads[start:stop], None if temperature is None else temperature[start:stop])
+            else:
+                part = SimulatedStep(made.counts[start:stop], made.pose[start:stop], made.dots[start:stop])
             if self.reference:
                 for i in range(0, stop - start, block):
                     # The estimate is for the middle of the block.

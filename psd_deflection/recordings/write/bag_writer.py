@@ -357,6 +357,11 @@ class BagWriter(_RecordSink):
         for change in before.changes:
             self._file.put(change)
 
+    @property
+    def oldest_age_s(self) -> float:
+        """How long before the newest message the oldest complete file ended, s; 0 without one."""
+        return (self._file.end_ns - self._ended[0][0].end_ns) * 1e-9 if self._ended else 0.0
+
     def drop_oldest(self) -> Path | None:
         """Delete the oldest complete file; None if there is only the one being written."""
         if not self._ended:

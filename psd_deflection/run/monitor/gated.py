@@ -207,6 +207,8 @@ class GatedServer(abc.ABC):
         finally:
             for task in tasks:
                 task.cancel()
+            # With aiohttp 3.9 a viewer that is being closed leaves the set at once, and its socket open.
+            connections = tuple(self._looked_through)
             leaving = [asyncio.create_task(v.close(code=WSCloseCode.GOING_AWAY)) for v in tuple(self.viewers)]
             if leaving:
                 # A viewer that does not read does not take leave either.
@@ -214,7 +216,7 @@ class GatedServer(abc.ABC):
                 for farewell in deaf:
                     farewell.cancel()
                 await asyncio.gather(*leaving, return_exceptions=True)
-            for connection in tuple(self._looked_through):
+            for connection in connections:
                 # What it has not read would keep the connection open.
                 if connection.transport is not None:
                     connection.transport.abort()

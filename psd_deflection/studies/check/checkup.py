@@ -10,7 +10,6 @@ import numpy as np
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.link import LinkStatics
-from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds
@@ -45,8 +44,10 @@ from psd_deflection.studies.check.wirings import (
     pattern,
     scales_of,
 )
+from psd_deflection.studies.loads.alignment import LatePsd, aligned
 from psd_deflection.studies.loads.annotated_times import CorrectedNote, correct_loads
 from psd_deflection.studies.loads.effective import LoadNote, effective_loads
+from psd_deflection.studies.loads.steps import link_motion
 
 LOADS = ('fx', 'fy', 'tz')
 TOGETHER = 0.95
@@ -84,7 +85,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     if int(present.sum()) < FEWEST_BLOCKS:
         raise RecordingError(f'{int(present.sum())} blocks of samples: at least {FEWEST_BLOCKS} are needed')
     static = loads @ LinkStatics.from_rig(rig).compliance
-    poses = _moved(rig, static, period)
+    poses = link_motion(rig, loads)
     means, held = (p[: n * size].reshape(n, size, 3).mean(axis=1) for p in (poses, static))
     shown = _simulated(rig, loads)[: n * size].reshape(n, size, 4).mean(axis=1)
     t = np.arange(n) * size * period
@@ -108,14 +109,6 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
 def _simulated(rig: Rig, loads: FloatArray, *, settled: bool = False) -> FloatArray:
     """Dots x1 y1 x2 y2 (n, 4), m, under ``loads`` (n, 3), N, N, N m; ``settled``: at rest under each."""
     return np.asarray(ForwardModel(rig, settled=settled).run(loads).true_dots.T)
-
-
-def _moved(rig: Rig, static: FloatArray, period: float) -> FloatArray:
-    """What the link's modes make of the poses (n, 3) at which the loads would settle."""
-    d = rig.dynamics
-    bending = mode_coefficients(d.bending_frequency, d.bending_damping_ratio, period)
-    torsion = mode_coefficients(d.torsion_frequency, d.torsion_damping_ratio, period)
-    return np.column_stack([Filter(c)(static[:, i]) for i, c in enumerate((bending, bending, torsion))])
 
 
 def block_means(samples: FloatArray, n: int) -> FloatArray:
@@ -176,7 +169,7 @@ class CheckProblem:
     """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``,
     ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``source``: the recording, '' at
     the bench. ``notes``: of loads that hung at another time than noted, that swayed, that were others, or that were
-    not noted.
+    not noted. ``late``: PSDs that are on another clock.
     """
 
     rig: Rig
@@ -186,6 +179,7 @@ class CheckProblem:
     drift_sd: FloatArray
     source: str = ''
     notes: Sequence[LoadNote] = ()
+    late: Sequence[LatePsd] = ()
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
@@ -194,18 +188,21 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     Raises ConfigError for a rig of more than two PSDs.
     """
     check_two_psds(rig, 'check')
-    corrected = correct_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
+    wiring = Wiring.from_rig(rig)
+    on_one_clock, apart = aligned(rig, wiring.to_psds(volts), loads)
+    moved = wiring.to_device(on_one_clock)
+    corrected = correct_loads(rig, moved[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
     late: Sequence[CorrectedNote] = ()
-    moved = volts
     if corrected is not None:
         loads, late = corrected.loads, corrected.notes
-        moved = np.where(corrected.unused[:, None], np.nan, volts)
-    wiring = Wiring.from_rig(rig)
+        moved = np.where(corrected.unused[:, None], np.nan, moved)
     effective = effective_loads(rig, wiring.to_psds(moved), loads)
     moved = np.where(np.isfinite(effective.volts).any(axis=1, keepdims=True), moved, np.nan)
     answered = responses(rig, moved, effective.loads)
     notes = (*late, *effective.notes)
-    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, notes)
+    return CheckProblem(
+        rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, notes, apart
+    )
 
 
 def check(problem: CheckProblem) -> Checkup:
@@ -229,7 +226,7 @@ def check(problem: CheckProblem) -> Checkup:
     if not determined and not dead:
         findings += _coverage(pushes, observed, wirings)
     # Pushes that are not there yet are no mistake.
-    wrong = light or problem.notes or any(f.name != 'load_coverage' for f in findings)
+    wrong = light or problem.late or problem.notes or any(f.name != 'load_coverage' for f in findings)
     verdict = WRONG if wrong else RIGHT if determined else CANNOT_TELL
     sizes = tuple(p.misfit(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(
@@ -244,6 +241,7 @@ def check(problem: CheckProblem) -> Checkup:
         drift=problem.drift,
         drift_sd=problem.drift_sd,
         light=light,
+        late=tuple(problem.late),
         notes=tuple(_notes(problem, best.wiring, sizes)),
         source=problem.source,
     )

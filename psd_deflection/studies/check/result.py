@@ -19,6 +19,7 @@ from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import DOTS, WIRINGS, PushResponse, WiringFit, line, on_channels
+from psd_deflection.studies.loads.alignment import LatePsd
 from psd_deflection.studies.study import PageSection, StudyResult
 
 MAINS = (50.0, 60.0)
@@ -202,6 +203,7 @@ class Checkup(StudyResult):
     each push over the expected one, NaN if it was not seen. ``wirings``: the wirings that explain the
     pushes. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``light``: of a PSD,
     in words, that it has too little or too much of it. ``notes``: what else is worth a look. ``source``: the recording.
+    ``late``: the PSDs that are on another clock; all the rest is judged with their readings moved.
     """
 
     study, json_name = 'check', 'check.json'
@@ -220,6 +222,7 @@ class Checkup(StudyResult):
     light: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = field(default=())
     source: str = ''
+    late: tuple[LatePsd, ...] = ()
 
     @property
     def sources(self) -> Mapping[str, str]:
@@ -290,6 +293,7 @@ class Checkup(StudyResult):
             'hum': {'hz': measured.hum_hz, **_by_name(CHANNELS, measured.hum.tolist())},
             'sums': measured.sums.tolist(),
             'light': dict(self.light),
+            'late': [late.tree() for late in self.late],
             'drift': _by_name(DOTS, self.drift.tolist()),
             'drift_sd': _by_name(DOTS, self.drift_sd.tolist()),
             'notes': list(self.notes),
@@ -350,7 +354,7 @@ def _verdict(checkup: Checkup) -> str:
 
 def _findings(checkup: Checkup) -> list[tuple[str, str]]:
     """What is wrong, and what to do about it."""
-    rows = []
+    rows = [(f'{late.where}: on another clock', late.words(checkup.source)) for late in checkup.late]
     for f in checkup.findings:
         where, name = f.where, NAMES[f.name]
         if f.name == 'psd_swap':

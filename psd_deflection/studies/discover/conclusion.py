@@ -238,6 +238,7 @@ class RigConclusion(Conclusion):
     ``alternative_fits``: complete models that these recordings do not exclude beside ``fit``, also those of mistakes of
     the set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     ``moves``: by how much at most an estimate is wrong that is not corrected for the effects: dX m, dY m, theta rad.
+    ``late``: of PSDs on another clock, in words.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
     became, '' if it is none. ``notify``: takes warnings.
     """
@@ -254,6 +255,7 @@ class RigConclusion(Conclusion):
     params_file: str | Path | None = None
     adopted: str = ''
     notify: Notify = warn_caller
+    late: tuple[str, ...] = ()
     rig_source: str = GIVEN_RIG
 
     @property
@@ -291,7 +293,7 @@ class RigConclusion(Conclusion):
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
         first, *remaining_lines = super().lines()
-        out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
+        out = [first, *self.late, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
         numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
         out += [f'rig file: {line(key, self.values[key])}' for key in numbers]
         for e in self.effects:

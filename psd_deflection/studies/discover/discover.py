@@ -6,13 +6,14 @@ The default answer is "nothing missing". A discrepancy that no effect explains i
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.recordings.observation import Observation
@@ -31,6 +32,7 @@ from psd_deflection.studies.discover.applied import (
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, LoadDirection
 from psd_deflection.studies.discover.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.problem import Problem, Progress
+from psd_deflection.studies.discover.recorded import Recorded
 from psd_deflection.studies.discover.recorded_rig import (
     RecordedRig,
     proposals_of,
@@ -57,6 +59,7 @@ from psd_deflection.studies.discover.steps import (
     where,
     without_effect,
 )
+from psd_deflection.studies.loads.alignment import SKEW
 from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded
 
@@ -327,6 +330,7 @@ def discover(
         setup=problem.setup,
         values=problem.values,
         known=machine.recorded.stated,
+        late=tuple(late.words(machine.recorded.observations[0].name) for late in machine.recorded.late),
         law=problem.law if problem.unknown else None,
         alternative_fits=problem.alternative_fits,
         unsettled=problem.unsettled,
@@ -374,6 +378,7 @@ def set_up(problem: Problem) -> Problem:
             values |= lines
     setup += wrong_load_findings(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
+    named = _clocks(machine.recorded, named)
     if machine.recorded.value_grid is not None and not machine.recorded.value_grid_stated:
         value_grid = machine.recorded.value_grid
         named.append(_named_value_grid(ws, value_grid))
@@ -391,6 +396,20 @@ def set_up(problem: Problem) -> Problem:
         values=values,
         stated_gap=machine.recorded.stated_gap,
     )
+
+
+def _clocks(recorded: Recorded, named: Sequence[NamedEffect]) -> list[NamedEffect]:
+    """Return ``named``, which the search found beside readings moved by whole samples, with the PSDs that are late."""
+    beside = {n.active.values['psd']: n for n in named if n.name == SKEW}
+    period = recorded.observations[0].period
+    effects = []
+    for late in recorded.late:
+        more = beside.pop(late.psd, None)
+        delay = late.seconds if more is None else late.rows * period + more.active.values['delay']
+        active = ActiveEffect(catalogue()[SKEW], {'psd': float(late.psd), 'delay': delay})
+        sd = {'delay': late.sd} if more is None else more.sd
+        effects.append(_named_by_readings(active, sd, 0.5 * late.evidence))
+    return [*effects, *(n for n in named if n.name != SKEW or n.active.values['psd'] in beside)]
 
 
 def noise_level(problem: Problem) -> Problem:
@@ -429,11 +448,15 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
 
 def _named_value_grid(workspace: Workspace, value_grid: ActiveEffect) -> NamedEffect:
     """Return the named effect of coarse steps, which the readings themselves show."""
-    gain = value_grid_gain(workspace, value_grid)
     sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
+    return _named_by_readings(value_grid, {value_grid.effect.value_grid: sd}, value_grid_gain(workspace, value_grid))
+
+
+def _named_by_readings(active: ActiveEffect, sd: Mapping[str, float], gain: float) -> NamedEffect:
+    """Return an effect that the readings show without any search, by a log-likelihood of ``gain``."""
     return NamedEffect(
-        active=value_grid,
-        sd={value_grid.effect.value_grid: sd},
+        active=active,
+        sd=sd,
         p=0.0,
         delta_bic=2.0 * gain,
         heldout=HeldOut(gain, float(np.sqrt(2.0 * gain))),

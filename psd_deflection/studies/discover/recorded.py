@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
@@ -29,6 +30,7 @@ from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, likely_delays
+from psd_deflection.studies.loads.alignment import SKEW, LatePsd, aligned
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads
 from psd_deflection.studies.loads.effective import (
     SwayingLoad,
@@ -56,7 +58,7 @@ class Recorded:
     ``value_grid_stated``: the rig file has it.
     ``delays``: by how much the loads may be noted late, s. ``corrected``: of each recording, its loads as they were put
     right, if they were. ``wrong``: where another load hung than noted; it is free.
-    ``fourth``: what the readings say of themselves.
+    ``fourth``: what the readings say of themselves. ``late``: the PSDs that were on another clock.
     """
 
     observations: tuple[Observation, ...]
@@ -72,6 +74,7 @@ class Recorded:
     corrected: tuple[CorrectedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
     fourth: FourthReading | None = None
+    late: tuple[LatePsd, ...] = ()
 
     @property
     def stated(self) -> tuple[ActiveEffect, ...]:
@@ -86,7 +89,7 @@ class Recorded:
     @property
     def mistaken(self) -> bool:
         """Whether anything was noted or wired otherwise than it was."""
-        return bool(self.findings) or any(m is not None and m.notes for m in self.corrected)
+        return bool(self.findings or self.late) or any(m is not None and m.notes for m in self.corrected)
 
     def delayed_loads(self, workspace: Workspace) -> list[Finding]:
         """Loads that acted at another time than noted; ``workspace``: where their times were fitted."""
@@ -110,12 +113,38 @@ def cleaned(recorded: Recorded) -> Recorded:
     )
 
 
+def on_one_clock(recorded: Recorded) -> Recorded:
+    """With the readings of all PSDs at the same times, to the nearest sample.
+
+    Raises RecordingError if a PSD is late in one recording otherwise than in another.
+    """
+    if SKEW in recorded.without:
+        return recorded
+    results = [aligned(o.rig, o.volts, o.loads) for o in recorded.observations]
+    late = results[0][1]
+    for o, (_, others) in zip(recorded.observations, results, strict=True):
+        if [(a.psd, a.rows) for a in others] != [(a.psd, a.rows) for a in late]:
+            words = (
+                a.words(name)
+                for name, listed in ((recorded.observations[0].name, late), (o.name, others))
+                for a in listed
+            )
+            raise RecordingError(f'{"; ".join(words)}: the clocks are not alike: search the recordings one by one')
+    if not late:
+        return recorded
+    stated = Workspace(recorded.observations, recorded.known)
+    both = zip(recorded.observations, results, strict=True)
+    observations = tuple(_with_volts(o, volts) for o, (volts, _) in both)
+    gap = stated.gap(stated.residual(recorded.known)[1])
+    return replace(recorded, observations=observations, late=late, stated_gap=gap)
+
+
 def put_right(recorded: Recorded) -> Recorded:
     """With loads at the times at which they acted, and with wiring, signs and units as they are."""
     timed = [time_loads(o) for o in recorded.observations]
     observations, wrong, lines = correct_wiring([o for o, _ in timed], recorded.known)
-    gap = 0.0
-    if wrong or any(corrected is not None and corrected.notes for _, corrected in timed):
+    gap = recorded.stated_gap
+    if not gap and (wrong or any(corrected is not None and corrected.notes for _, corrected in timed)):
         stated = Workspace(recorded.observations, recorded.known)
         gap = stated.gap(stated.residual(recorded.known)[1])
     values = {**recorded.values, **lines}
@@ -166,7 +195,7 @@ def _on_steps(volts: FloatArray, rows: list[int], step: float) -> FloatArray:
     return out
 
 
-STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, put_right, snapped)
+STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, on_one_clock, put_right, snapped)
 
 
 def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:

@@ -15,10 +15,9 @@ import numpy.typing as npt
 from psd_deflection.measure.steps import LEAST_SHARE, PERIODS, DotStep, lasting_steps
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.plate.linear import design_matrix
-from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.steps import applied, link_modes, time_of_step
+from psd_deflection.studies.loads.steps import applied, link_modes, link_motion, time_of_step
 
 SHARE = 0.02
 """Loads that change at more than this share of the samples were measured, not noted by a person."""
@@ -361,10 +360,7 @@ def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], pe
 
 def residual_of_dots(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
     """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 2P), m."""
-    period = 1.0 / rig.converter.sample_rate_hz
-    static = loads @ LinkStatics.from_rig(rig).compliance
-    bending, torsion = (mode_coefficients(f, ratio, period) for f, ratio in link_modes(rig))
-    poses = np.column_stack([Filter(c)(static[:, k]) for k, c in enumerate((bending, bending, torsion))])
+    poses = link_motion(rig, loads)
     scale = np.maximum(np.abs(poses).max(axis=0), 1e-30)
     t = np.linspace(-1.0, 1.0, len(dots))
     design = np.column_stack((poses / scale, np.ones_like(t), t))

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from psd_deflection.measure.steps import DotStep
+from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
@@ -40,6 +41,13 @@ def link_modes(rig: Rig) -> tuple[tuple[float, float], ...]:
     """Natural frequency, Hz, and damping ratio of bending and of torsion."""
     d = rig.dynamics
     return (d.bending_frequency, d.bending_damping_ratio), (d.torsion_frequency, d.torsion_damping_ratio)
+
+
+def link_motion(rig: Rig, loads: FloatArray) -> FloatArray:
+    """Return the poses (n, 3), m, m, rad, of the rig's link under ``loads`` (n, 3), N, N, N m, held, from rest."""
+    static = loads @ LinkStatics.from_rig(rig).compliance
+    bending, torsion = (mode_coefficients(*mode, 1.0 / rig.converter.sample_rate_hz) for mode in link_modes(rig))
+    return np.column_stack([Filter(c)(static[:, k]) for k, c in enumerate((bending, bending, torsion))])
 
 
 def time_of_step(

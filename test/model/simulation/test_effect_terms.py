@@ -209,7 +209,7 @@ def test_an_amplifier_lags_as_its_equation_says(tau: float, phase: float) -> Non
 
 @pytest.mark.parametrize('psd', [1, 2])
 @pytest.mark.parametrize('phase', [0.0, 0.3e-3])
-@pytest.mark.parametrize('delay', [0.0, 0.1e-3, 0.4e-3, 1e-3, 1.3e-3, 2.7e-3, 6e-3])
+@pytest.mark.parametrize('delay', [-0.6e-3, 0.0, 0.1e-3, 0.4e-3, 1e-3, 1.3e-3, 2.7e-3, 6e-3])
 def test_one_psds_samples_are_late_by_the_delay(psd: int, phase: float, delay: float) -> None:
     t, got = electronics('channel_skew', {'psd': psd, 'delay': delay}, phase, PIECES)
     want = smooth(t)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.devices.serve import served_loads
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation import loads, simulator
-from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.catalogue import make_active, with_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
@@ -149,26 +149,34 @@ STEPS = [(0.0, 0.0, 0.0), (5.0, -40.0, -20.0), (-10.0, 0.0, 10.0)]
 FINER = 10
 
 
-def fine_volts() -> FloatArray:
-    """Volts (6, n FINER + 1) of the nominal rig at 10 kHz, the loads held for 1 ms."""
+def fine_volts(more: int = 1) -> FloatArray:
+    """Volts (6, n FINER + more) of the nominal rig at 10 kHz, the loads held for 1 ms, the last of them longer."""
     fine = load_rig(overrides={'converter.sample_rate_hz': 1e3 * FINER})
     history = np.repeat(loads.steps(STEPS, 0.05).loads, FINER, axis=0)
-    return ForwardModel(fine).run(np.concatenate((history, history[-1:]))).volts
+    return ForwardModel(fine).run(np.concatenate((history, np.repeat(history[-1:], more, axis=0)))).volts
 
 
 def effect_volts(*effects: ActiveEffect) -> FloatArray:
     return ForwardModel(load_rig(), effects).run(loads.steps(STEPS, 0.05).loads).volts
 
 
-@pytest.mark.parametrize('delay', [0.4e-3, 1e-3, 3.7e-3])
+@pytest.mark.parametrize('delay', [-3.7e-3, -0.4e-3, 0.4e-3, 1e-3, 3.7e-3])
 def test_a_delay_is_exact_just_after_a_load_step_too(delay: float) -> None:
-    late = round(delay * 1e3 * FINER)
-    fine = fine_volts()
-    expected = fine[:, :-1:FINER].copy()
-    expected[3:] = np.concatenate((np.repeat(fine[3:, :1], late, axis=1), fine[3:]), axis=1)[:, : -1 - late : FINER]
+    fine = fine_volts(40)
+    at = np.arange(0, fine.shape[1] - 40, FINER)
+    expected = fine[:, at]
+    expected[3:] = fine[3:, np.maximum(at - round(delay * 1e3 * FINER), 0)]
     found = effect_volts(make_active('channel_skew', {'psd': 2, 'delay': delay}, 'test'))
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10)
-    assert np.abs(expected - fine[:, :-1:FINER]).max() > 1e-2
+    assert np.abs(expected - fine[:, at]).max() > 1e-2
+
+
+def test_a_running_rig_has_no_early_psd() -> None:
+    rig = with_effects(load_rig(), ['channel_skew,psd=2,delay=-0.0015'], 'test')
+    simulator, history = RigSimulator(rig), loads.constant((0.0, -5.0, 1.0), 0.05).loads
+    assert simulator.step(history).counts.shape == (50, 6)
+    with pytest.raises(ConfigError, match='a PSD that is early is simulated with all loads at once'):
+        simulator.step(history)
 
 
 def lagged(fine: FloatArray, tau: float) -> FloatArray:

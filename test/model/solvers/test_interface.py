@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import SOLVERS, SolverStatus, make_solver, solver_from_rig
@@ -98,6 +99,26 @@ def test_solver_cache_between_blocks_changes_no_answer(golden: Any, method: str,
         with contextlib.suppress(ValueError):
             gain[:] = 7.0
         np.testing.assert_array_equal(solver.gain(dots, variances, got), fresh.gain(dots, variances, want))
+
+
+@pytest.mark.parametrize('psds', [2, 3])
+@pytest.mark.parametrize('method', ['exact', 'wls', 'iterative'])
+def test_one_block_and_many_have_the_same_bits(method: str, psds: int) -> None:
+    """Their gains too. Of two PSDs the last block's plate points coincide, so that nothing says how it is turned."""
+    rng = np.random.default_rng(psds)
+    centers = rng.uniform(-0.1, 0.1, (psds, 2))
+    solver = make_solver(method, Geometry(centers, np.full((psds, 2), 1e-3), np.zeros(psds), 0.585, arithmetic=FIXED))
+    dots = rng.normal(size=(30, 2 * psds)) * rng.choice([1e-6, 1e-3, 2e-2], (30, 1))
+    if psds == 2:
+        dots[-1] = (-centers).ravel()
+    for variances in ((4e-12,) * 2 * psds, tuple((rng.uniform(1.0, 9.0, 2 * psds) * 1e-12).tolist())):
+        many = solver.solve_many(dots, np.array(variances))
+        gains = solver.gain_many(dots[:-1], variances, solver.solve_many(dots[:-1], np.array(variances)))
+        for i, (own, row) in enumerate(zip(dots.tolist(), many.rows(), strict=True)):
+            one = solver.solve(tuple(own), variances)
+            assert repr(one._replace(iterations=0)) == repr(row)
+            if i < 29:
+                np.testing.assert_array_equal(solver.gain(tuple(own), variances, one), gains[i])
 
 
 @pytest.mark.parametrize(('method', 'options'), SMOOTH)
@@ -237,24 +258,16 @@ def test_what_cannot_be_observed_is_not_converged() -> None:
     assert np.isnan(one.covariance).all()
 
 
-def test_endless_steps_end() -> None:
+@pytest.mark.parametrize(('slope', 'reading', 'steps'), [(1.0, 1.0, MAX_STEPS), (1e-150, 1e160, 1)])
+def test_steps_without_an_end_end(slope: float, reading: float, steps: int) -> None:
+    """The model never comes nearer; a slope of 1e-150 and a reading of 1e160 have 1e310 to go."""
+
     def away(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
-        return [0.0], [(1.0,)]
+        return [0.0], [(slope,)]
 
-    one = fit(away, (0.0,), (1.0,), (1.0,))
+    one = fit(away, (0.0,), (reading,), (1.0,))
     assert not one.converged
-    assert one.steps == MAX_STEPS == 50
-
-
-def test_a_step_without_end_is_the_last() -> None:
-    """A slope of 1e-150 and a reading of 1e160: 1e310 to go."""
-
-    def flat(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
-        return [0.0], [(1e-150,)]
-
-    one = fit(flat, (0.0,), (1e160,), (1.0,))
-    assert not one.converged
-    assert one.steps == 1
+    assert (one.steps, MAX_STEPS) == (steps, 50)
 
 
 def test_the_residual_is_that_at_the_answer_to_the_last_digit() -> None:

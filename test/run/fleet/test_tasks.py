@@ -154,22 +154,20 @@ def test_another_word_is_rejected(word: str) -> None:
         tasks.check_engine(word)
 
 
-def test_encryption_without_certificates_is_rejected() -> None:
+# Nothing listens on the port of tcpmux.
+@pytest.mark.parametrize(
+    ('word', 'error', 'message'),
+    [
+        ('dask://127.0.0.1:1', DaemonError, r'^dask://127\.0\.0\.1:1: no Dask scheduler answers'),
+        ('dask+tls://127.0.0.1:1', ConfigError, r"^--executor dask\+tls://\S+ Dask's configuration has no cert"),
+    ],
+)
+def test_a_scheduler_out_of_reach_is_named(
+    word: str, error: type[Exception], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip('distributed')
-    with (
-        pytest.raises(ConfigError, match=r"^--executor dask\+tls://127\.0\.0\.1:1: Dask's configuration has no cert"),
-        tasks.open_engine('dask+tls://127.0.0.1:1'),
-    ):
-        pass
-
-
-def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('psd_deflection.run.fleet.tasks.CONNECT_S', 0.2)
-    # Nothing listens on the port of tcpmux.
-    with (
-        pytest.raises(DaemonError, match=r'^dask://127\.0\.0\.1:1: no Dask scheduler answers'),
-        tasks.open_engine('dask://127.0.0.1:1'),
-    ):
+    with pytest.raises(error, match=message), tasks.open_engine(word):
         pass
 
 

@@ -179,9 +179,14 @@ def test_the_token_of_the_printed_address_opens_the_buttons(page: Page, serve: C
     page.until('document.getElementById("ask").open')
     page.driver.find_element(By.ID, 'cancel').click()
     page.until('!document.getElementById("ask").open')
-    page.driver.find_element(By.ID, 'zero').click()
+    page.driver.find_element(By.ID, 'mark').click()
     page.until('document.getElementById("ask").open')
+    page.until(f'performance.now() > {page.js("performance.now()")} + 500')
     page.driver.find_element(By.ID, 'token').send_keys(serving.server.token + Keys.ENTER)
+    page.until('document.getElementById("notice").textContent === "mark: mark 1"')
+    # A mark is of the click, not of the token.
+    assert serving.shown.lates[0] > 0.5
+    page.driver.find_element(By.ID, 'zero').click()
     page.until('document.getElementById("notice").textContent === "unloaded dots taken"')
     assert serving.shown.zeros == 1
     assert serving.server.token not in str(page.js('location.href'))
@@ -259,6 +264,9 @@ def test_the_first_load_is_small_and_dx_is_above_dy(page: Page, serve: Callable[
     page.until(f'{HEIGHTS}.every(Number.isFinite)', 'traces of dX and dY')
     dx, dy = page.js(HEIGHTS)
     assert dx < dy - 20
+    assert page.js('["sd_dx", "sd_dy", "sd_theta"].every((id) => document.getElementById(id).title)')
+    # A label of an enlarged axis is of its tick's time: half a second is not rounded away.
+    assert page.later('import("/page/charts.js").then((m) => [2.5, 1, 0.25].map(m.decimals))') == [1, 0, 2]
     assert 20_000 < page.js(FETCHED) < MOST_BYTES
 
 
@@ -286,6 +294,10 @@ def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serv
         page.until('document.getElementById("record").textContent === "● Recording"')
         assert page.js('document.documentElement.scrollWidth') <= width
         assert page.js(STICKING_OUT) == []
+        ends = (
+            'arguments[0].map((b) => b.parentElement.getBoundingClientRect().right - b.getBoundingClientRect().right)'
+        )
+        assert max(page.js(ends, page.driver.find_elements(By.CLASS_NAME, 'enlarge'))) < 20
         header = page.js('document.querySelector("header").getBoundingClientRect().height')
         assert header < 100
     finally:
@@ -331,6 +343,29 @@ def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Se
     page.until('document.getElementById("weigh").open && document.getElementById("since_step").hidden')
     assert page.js('document.getElementById("ago").value') == '0'
     page.driver.find_element(By.ID, 'weigh_cancel').click()
+    assert page.complaints() == []
+
+
+@pytest.mark.slow
+def test_a_load_field_takes_a_decimal_comma(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    serving.give(0, 20)
+    page.open(serving.url)
+    page.until('document.body.dataset.rows >= 20')
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("weigh").open')
+    fields = [page.driver.find_element(By.ID, name) for name in ('fx', 'fy')]
+    # Three digits may be thousands; the browser keeps the dialog open and names the field.
+    for typed in ('1,500', '1.000,5', '1e-', ''):
+        fields[1].clear()
+        fields[1].send_keys(typed + Keys.ENTER)
+        page.until('document.querySelector("#fy:invalid") && document.getElementById("weigh").open')
+    for field, typed in zip(fields, (' +.5', '-1,5'), strict=True):
+        field.clear()
+        field.send_keys(typed)
+    page.driver.find_element(By.CSS_SELECTOR, '#weigh button[value=set]').click()
+    page.until('document.getElementById("notice").textContent === "load noted"')
+    assert serving.shown.loads == [(0.5, -1.5, 0.0, False)]
     assert page.complaints() == []
 
 

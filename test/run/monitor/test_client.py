@@ -45,6 +45,9 @@ def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest
     assert serving.shown.agos == [0.0, 0.0, 3.4, None]
     assert main(['mark', 'bumped', 'it']) == 0
     assert serving.shown.marks == ['bumped it']
+    # Four loads and a mark, of the time at which this program was started.
+    assert len(serving.shown.lates) == 5
+    assert 0.0 < serving.shown.lates[0] < serving.shown.lates[-1]
     assert serving.shown.zeros == 1
     assert serving.shown.recordings == ['recordings/test', None]
     assert serving.shown.loads[:2] == [(0.0, -10.0, 0.5, False), (-10.0, 0.0, 0.0, True)]
@@ -62,6 +65,13 @@ def test_a_rejection_is_an_error_with_its_reason(serve: Serve, capsys: pytest.Ca
     serving.shown.rejection = 'not zeroed: no data flows'
     assert main(['zero']) == 7
     assert capsys.readouterr().err == f'psd-deflection zero: {serving.url}: not zeroed: no data flows\n'
+
+
+@pytest.mark.parametrize('command', ['zero', 'mark', 'load', 'record', 'echo'])
+def test_what_speaks_to_a_daemon_starts_without_scipy(command: str) -> None:
+    code = f'from psd_deflection.cli.main import make_parser; make_parser([{command!r}])'
+    code += f'; import psd_deflection.cli.run.{command}, sys; sys.exit("scipy" in sys.modules)'
+    assert subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=False).returncode == 0
 
 
 def test_zero_waits_for_a_link_that_moves(

@@ -132,6 +132,27 @@ def test_a_right_rig_is_accused_of_nothing() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('psd', [1, 2])
+@pytest.mark.parametrize('rows', [8, -40, 3000, -3000])
+def test_a_psd_on_another_clock_is_told_first_and_no_wire(rows: int, psd: int) -> None:
+    """Beside one sign that is wrong: both are named, and nothing else."""
+    loads = np.concatenate([np.zeros((2000, 3)), np.repeat([(0, -10, 0), (0, 0, 0), (12, 0, 0)], 2500, axis=0)])
+    loads = np.concatenate([loads, np.repeat([(0, 0, 4), (3, 0, 0), (0, 0, 0)], 1700, axis=0)]).astype(np.float64)
+    volts = recorded(loads, 1, every_turn()[1])
+    own, n = slice(3 * psd - 3, 3 * psd), len(volts) - abs(rows)
+    moved = volts[max(rows, 0) :][:n].copy()
+    moved[:, own] = volts[max(-rows, 0) :][:n, own]
+    found = checked(moved, loads[max(rows, 0) :][:n])
+    ((late,), (wrong,)) = found.late, found.findings
+    assert (found.verdict, late.where, wrong.name) == (WRONG, f'psd_{psd}', 'channel_sign')
+    assert abs(late.seconds - 1e-3 * rows) < 1e-4
+    assert found.sentences()[1].startswith(f'psd_{psd}: on another clock: ')
+    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in found.sentences()[1]
+    assert found.tree()['late'][0]['rows'] == rows
+    assert found.values == lines_of(every_turn()[1])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize('channel', ['x1', 'y1', 'x2', 'y2'])
 @pytest.mark.parametrize('stuck', [False, True])
 def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> None:

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
-from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig, make_active
+from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig, make_active, with_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, values_of
@@ -248,17 +248,6 @@ def test_bad_words_of_simulate_are_rejected(
 ) -> None:
     assert main(['simulate', '--out', str(tmp_path / 'x.csv'), *arguments]) == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_recording_without_loads_is_rejected_with_the_way_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / 'bare.csv'
-    rows = [f'{i / 1000:.3f},0,0,5,0,0,5' for i in range(200)]
-    path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
-    assert main(['discover', str(path), '--out', str(tmp_path / 'out'), '--quiet']) == 4
-    assert 'holds no loads' in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -577,6 +566,24 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     assert mistake.fix.startswith('link.length: 0.596')
     assert found.floors < 1.05
     assert 'The set-up is not as' in found.sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('psd', 'rows', 'beside'), [(2, 8, 0.0003), (2, -8, 0.0003), (1, 40, 0.0), (2, -1000, 0.0)])
+def test_a_psd_on_another_clock_is_named_late_or_early(psd: int, rows: int, beside: float) -> None:
+    rig = with_effects(RIG, [f'channel_skew,psd={psd},delay={beside}'] if beside else [], 'test')
+    o, late, n = observe(rig, 5), slice(3 * psd - 3, 3 * psd), len(HISTORY.loads) - abs(rows)
+    volts = o.volts[max(rows, 0) :][:n].copy()
+    volts[:, late] = o.volts[max(-rows, 0) :][:n, late]
+    recorded = Observation('test', RIG, volts, o.loads[max(rows, 0) :][:n])
+    found = found_in(recorded)
+    (effect,) = found.effects
+    assert (effect.name, effect.values['psd'], found.setup) == ('channel_skew', psd, ())
+    assert effect.values['delay'] == pytest.approx(1e-3 * rows + beside, abs=4.0 * effect.sd['delay'])
+    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in found.lines()[1]
+    assert found.floors < 1.05
+    with pytest.raises(RecordingError, match='the clocks are not alike'):
+        found_in(recorded, o)
 
 
 def test_a_jump_is_found_at_its_sample() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from psd_deflection.measure import steps as found_steps
 from psd_deflection.measure.steps import DotStep, last_load_change
+from psd_deflection.model.simulation.catalogue import with_effects
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
@@ -20,6 +21,7 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
+from psd_deflection.studies.loads.alignment import aligned
 from psd_deflection.studies.loads.annotated_times import (
     ALIKE_S,
     CorrectedLoads,
@@ -107,13 +109,21 @@ def test_right_times_and_small_delay_are_unchanged(loads: FloatArray) -> None:
     assert corrected(ROTATED, loads) is None
 
 
-def test_slow_loads_noted_as_steps_are_ramps() -> None:
-    found = corrected(volts(applied(0.8)), annotated((0.4,) * 6))
-    assert found is not None
-    assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
-    assert {n.name for n in found.notes} == {'load_ramp'}
-    assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
-    assert not found.unused.any()
+@pytest.mark.parametrize(('psd', 'rows'), [(1, 40), (2, 8), (2, -40)])
+def test_the_psd_that_agrees_with_the_loads_stays(psd: int, rows: int) -> None:
+    late, n = slice(3 * psd - 3, 3 * psd), COUNT - abs(rows)
+    read, loads = QUIET[max(rows, 0) :][:n].copy(), applied()[max(rows, 0) :][:n]
+    in_time = read.copy()
+    read[:, late] = QUIET[max(-rows, 0) :][:n, late]
+    moved, (found,) = aligned(RIG, read, loads)
+    assert (found.psd, found.rows, found.reference) == (psd, rows, 3 - psd)
+    there = np.isfinite(moved).all(axis=1)
+    assert np.count_nonzero(~there) == abs(rows)
+    np.testing.assert_array_equal(moved[there], in_time[there])
+    # What the rig file says of it is nothing new, and what is right stays.
+    known = with_effects(RIG, [f'channel_skew,psd={psd},delay={1e-3 * rows}'], 'test')
+    for rig, volts in ((known, read), (RIG, in_time)):
+        assert aligned(rig, volts, loads) == (volts, ())
 
 
 def test_other_natural_frequencies_change_no_time() -> None:
@@ -139,12 +149,16 @@ def test_lost_samples_change_no_time() -> None:
     assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.003)
 
 
-def test_slow_load_annotated_as_step_is_a_ramp() -> None:
-    found = corrected(volts(applied(0.8)), annotated((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
+@pytest.mark.parametrize(
+    ('late', 'names'),
+    [((0.4,) * 6, ['load_ramp'] * 6), ((0.0, 2.0, 0.0, 0.0, 0.0, 0.0), ['load_ramp', 'load_time', *['load_ramp'] * 4])],
+)
+def test_slow_load_annotated_as_step_is_a_ramp(late: tuple[float, ...], names: list[str]) -> None:
+    found = corrected(volts(applied(0.8)), annotated(late))
     assert found is not None
     assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
-    assert [n.name for n in found.notes] == ['load_ramp', 'load_time', *['load_ramp'] * 4]
-    assert [round(n.value, 2) for n in found.notes[:2]] == [0.8, 2.0]
+    assert [n.name for n in found.notes] == names
+    assert [round(n.value, 2) for n in found.notes[:2]] == [0.8, max(0.8, late[1])]
     assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
     assert not found.unused.any()
 

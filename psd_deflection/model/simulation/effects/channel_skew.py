@@ -1,9 +1,9 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of one PSD are late.
+"""The samples of one PSD are late, or early: another clock, or a converter that samples in turn.
 
 Volts between samples come from the model at that time, so a delay of any size is exact, just after a
-load step too. No future sample is used: a value before a sample is one after the sample before.
+load step too. A value before a sample is one after the sample before.
 """
 
 import math
@@ -11,21 +11,32 @@ import math
 import numpy as np
 
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
+
+
+def _steps(physics: Physics, values: Values) -> tuple[int, float]:
+    """By how many samples a reading is late, and the share of a sample by which that is too much."""
+    steps = (values['delay'] - physics.phase) / physics.period
+    integer = round(steps) if abs(steps - round(steps)) < 1e-9 else math.ceil(steps)
+    return integer, max(integer - steps, 0.0)
+
+
+def _ahead(physics: Physics, values: Values) -> int:
+    return max(-_steps(physics, values)[0], 0)
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     if samples.t.size == 0:
         return
     p = samples.physics
-    steps = (values['delay'] - p.phase) / p.period
-    integer = math.ceil(steps)
-    if abs(steps - round(steps)) < 1e-9:
-        integer = round(steps)
-        steps = float(integer)
+    integer, share = _steps(p, values)
     psd = int(values['psd']) - 1
     rows = slice(3 * psd, 3 * psd + 3)
-    now = samples.between((integer - steps) * p.period)[rows]
+    now = samples.between(share * p.period)[rows]
+    if integer < 0:
+        samples.volts[rows, :integer] = now[:, -integer:]
+        return
     if 'before' not in state:
         # At rest until the first sample.
         state['before'] = np.repeat(samples.between(0.0)[rows, :1], integer, axis=1)
@@ -37,15 +48,16 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
 EFFECT = Effect(
     name='channel_skew',
     stage='electronics',
-    summary="one PSD's samples are late",
+    summary="one PSD's samples are late or early",
     equation='v_i(t) -> v_i(t - delay)',
-    source='multiplexed converters',
+    source='two clocks; multiplexed converters',
     needs='fast motion (steps, sweeps)',
     parameters=(
         PSD,
-        EffectParameter('delay', 's', 0.0, 0.1, 1e-5, 'how late'),
+        EffectParameter('delay', 's', -4.0, 4.0, 1e-5, 'how late; below 0 how early'),
     ),
     point='volts',
     apply=_apply,
+    ahead=_ahead,
     order=1,
 )
