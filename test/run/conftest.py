@@ -11,21 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.devices.protocol.frames import (
-    FrameDecoder,
-    GoodFrame,
-    HelloFrame,
-    HelloRequestFrame,
-    SampleFrame,
-    encode,
-)
+from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.records import CHANNELS, DeflectionEstimate, Record
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run import acquisition
 from test.heard import WAIT_S
 
-HELLO = HelloFrame(
+HELLO = protocol.HelloFrame(
     1,
     {
         'serial': 'T-1',
@@ -42,7 +35,7 @@ class ScriptedDevice:
 
     def __init__(self, link: Path) -> None:
         self.link = link
-        self.answer: bytes = encode(HELLO)
+        self.answer: bytes = protocol.encode(HELLO)
         self.greeted = threading.Event()
         self.plug()
 
@@ -54,7 +47,7 @@ class ScriptedDevice:
         self._thread.start()
 
     def _listen(self, master: int, gone: threading.Event) -> None:
-        decoder = FrameDecoder()
+        decoder = protocol.FrameDecoder()
         poll = select.poll()
         poll.register(master, select.POLLIN)
         while not gone.is_set():
@@ -67,7 +60,7 @@ class ScriptedDevice:
                 except OSError:
                     continue
                 for frame in decoder.feed(b'\x00' + received):
-                    if isinstance(frame, HelloRequestFrame):
+                    if isinstance(frame, protocol.HelloRequestFrame):
                         # Who asked may have left by now.
                         with contextlib.suppress(OSError):
                             self.send(self.answer)
@@ -80,8 +73,8 @@ class ScriptedDevice:
             except BlockingIOError:
                 select.select((), (self.terminal.master,), (), 1.0)
 
-    def send_frames(self, *frames: GoodFrame) -> None:
-        self.send(b''.join(encode(f) for f in frames))
+    def send_frames(self, *frames: protocol.GoodFrame) -> None:
+        self.send(b''.join(protocol.encode(f) for f in frames))
 
     @property
     def plugged(self) -> bool:
@@ -110,15 +103,17 @@ class Estimates:
 
 
 @pytest.fixture(scope='session')
-def sample() -> Callable[..., SampleFrame]:
-    def make(seq: int, t_us: int | None = None, flags: int = 0) -> SampleFrame:
-        return SampleFrame(flags, seq % 2**32, seq * 1000 if t_us is None else t_us, (0, 0, 16384, 0, 0, 16384))
+def sample() -> Callable[..., protocol.SampleFrame]:
+    def make(seq: int, t_us: int | None = None, flags: int = 0) -> protocol.SampleFrame:
+        return protocol.SampleFrame(
+            flags, seq % 2**32, seq * 1000 if t_us is None else t_us, (0, 0, 16384, 0, 0, 16384)
+        )
 
     return make
 
 
 @pytest.fixture(scope='session')
-def hello() -> HelloFrame:
+def hello() -> protocol.HelloFrame:
     return HELLO
 
 

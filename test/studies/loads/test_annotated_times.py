@@ -22,15 +22,6 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.alignment import aligned
-from psd_deflection.studies.loads.annotated_times import (
-    ALIKE_S,
-    CorrectedLoads,
-    CorrectedNote,
-    correct_loads,
-    ordinal,
-    shifted,
-    unannotated_steps,
-)
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
 from test.studies.held_loads import RIG, answers, read
 
@@ -68,8 +59,8 @@ QUIET = volts(applied())
 ROTATED = volts(applied(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
 
 
-def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedLoads | None:
-    return correct_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
+def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> annotated_times.CorrectedLoads | None:
+    return annotated_times.correct_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
 
 
 @pytest.mark.slow
@@ -93,7 +84,7 @@ def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedL
 def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], rotated: bool) -> None:
     found = corrected(ROTATED if rotated else QUIET, annotated(late))
     assert found is not None
-    wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
+    wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > annotated_times.ALIKE_S}
     assert {n.number: n.delay for n in found.notes} == pytest.approx(wrong, abs=0.002)
     assert not found.unused.any()
     assert np.count_nonzero(np.abs(found.loads - applied()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
@@ -213,8 +204,8 @@ def test_load_between_samples_moves_link_at_its_time(moments: float) -> None:
     frequency, ratio, first = 14.0, 0.02, 100
     loads = np.zeros((1000, 3))
     loads[first:, 1] = -50.0
-    note = CorrectedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
-    later = shifted(note, loads, 1e-3)
+    note = annotated_times.CorrectedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
+    later = annotated_times.shifted(note, loads, 1e-3)
     moved = Filter(mode_coefficients(frequency, ratio, 1e-3))((loads + later([moments]))[:, 1] / -50.0)
     # The step response of an oscillator, from the time of the step on.
     w = 2.0 * math.pi * frequency
@@ -230,8 +221,8 @@ def test_load_between_samples_moves_link_at_its_time(moments: float) -> None:
 def test_load_from_second_sample_is_shifted_completely() -> None:
     loads = np.tile([0.0, -20.0, 0.0], (100, 1))
     loads[0] = 0.0
-    note = CorrectedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)
-    later = shifted(note, loads, 0.001)
+    note = annotated_times.CorrectedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)
+    later = annotated_times.shifted(note, loads, 0.001)
     # Four quarters of a sample later nothing acts in the second sample.
     assert later([4.0])[1] == pytest.approx([0.0, 20.0, 0.0])
     assert later([4.0])[2:] == pytest.approx(0.0)
@@ -239,8 +230,8 @@ def test_load_from_second_sample_is_shifted_completely() -> None:
 
 def note(
     annotated: float, applied: float, took: float = 0.0, *, rest_only: bool = False, number: int = 3
-) -> CorrectedNote:
-    return CorrectedNote(number, (1.5, -2.0, 0.25), annotated, applied, took, rest_only)
+) -> annotated_times.CorrectedNote:
+    return annotated_times.CorrectedNote(number, (1.5, -2.0, 0.25), annotated, applied, took, rest_only)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +251,7 @@ def note(
         ),
     ],
 )
-def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: CorrectedNote, words: str) -> None:
+def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: annotated_times.CorrectedNote, words: str) -> None:
     assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
 
 
@@ -277,7 +268,7 @@ def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: CorrectedNo
     ],
 )
 def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
-    one: CorrectedNote, name: str, value: float, size: float, wrong: bool
+    one: annotated_times.CorrectedNote, name: str, value: float, size: float, wrong: bool
 ) -> None:
     assert (one.name, one.where, one.value, one.size, one.wrong) == (name, 'load 3', value, size, wrong)
 
@@ -288,7 +279,7 @@ def test_ordinals_end_as_their_last_word() -> None:
         teens = 10 < number % 100 < 20
         return 'th' if teens else ['th', 'st', 'nd', 'rd', *['th'] * 6][int(str(number)[-1])]
 
-    assert [ordinal(n) for n in range(1, 1001)] == [f'{n}{ending(n)}' for n in range(1, 1001)]
+    assert [annotated_times.ordinal(n) for n in range(1, 1001)] == [f'{n}{ending(n)}' for n in range(1, 1001)]
 
 
 def stepped(n: int, steps: dict[int, float], noise: float = 0.0, seed: int = 0) -> FloatArray:
@@ -413,7 +404,7 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     # Applied from sample 20 to 28: before is the sample before 19, after is the second one beyond 28.
     step = loads[30] - loads[18]
     ramp = note(12.0, 10.0, 4.0)
-    effective = shifted(ramp, loads, 0.5)
+    effective = annotated_times.shifted(ramp, loads, 0.5)
 
     def share(start: float, took: float) -> FloatArray:
         return np.asarray(np.clip((t + 0.5 - start) / took, 0.0, 1.0))
@@ -429,9 +420,9 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     assert effective([-4.0, 6.0]) == pytest.approx(both, abs=1e-3)
     assert np.abs(effective([-4.0, 0.0]) + effective([0.0, 6.0]) - both).max() > 0.01 * np.abs(step).max()
     # At the begin and at the end of a recording there is no more.
-    first = shifted(note(0.0, 0.0, 1.0), loads, 0.5)
+    first = annotated_times.shifted(note(0.0, 0.0, 1.0), loads, 0.5)
     assert first([4.0, 0.0])[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
-    last = shifted(note(19.0, 19.0, 1.0), loads, 0.5)
+    last = annotated_times.shifted(note(19.0, 19.0, 1.0), loads, 0.5)
     assert last([4.0, 0.0])[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
 
 
@@ -592,19 +583,21 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     with_pieces(monkeypatch, steps, {3000.0: (3.01, 0.0), 8000.0: (8.0, 0.0)})
     dots = np.zeros((20_000, 4))
     for apart, reported in ((249, []), (250, [3.01])):
-        assert unannotated_steps(RIG, dots, annotated_at(8000, 8000 + apart)) == reported
-        assert (correct_loads(RIG, dots, annotated_at(3000, 9000, 9000 + apart)) is None) == (not reported)
+        assert annotated_times.unannotated_steps(RIG, dots, annotated_at(8000, 8000 + apart)) == reported
+        assert (annotated_times.correct_loads(RIG, dots, annotated_at(3000, 9000, 9000 + apart)) is None) == (
+            not reported
+        )
     # A note is of a step from two widths before its first sample to two after its last.
     width = 2 * round(4.0 / RIG.dynamics.bending_frequency * 1000.0)
     for at, reported in ((2800 - width, []), (2799 - width, [3.01]), (3200 + width, []), (3201 + width, [3.01])):
-        assert unannotated_steps(RIG, dots, annotated_at(at, 8000)) == reported
+        assert annotated_times.unannotated_steps(RIG, dots, annotated_at(at, 8000)) == reported
     # A ramp is one change, which ends once; one that comes two samples later is another.
     ramp = annotated_at(*range(8000, 8100))
-    assert unannotated_steps(RIG, dots, ramp) == [3.01]
-    assert unannotated_steps(RIG, dots, annotated_at(8000, 8002)) == []
+    assert annotated_times.unannotated_steps(RIG, dots, ramp) == [3.01]
+    assert annotated_times.unannotated_steps(RIG, dots, annotated_at(8000, 8002)) == []
     # Its end may come with a note of the next one within a quarter of a second.
-    assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8200)) == []
-    assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8400)) == [3.01]
+    assert annotated_times.unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8200)) == []
+    assert annotated_times.unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8400)) == [3.01]
 
 
 @pytest.mark.parametrize(('longer', 'fitted'), [(0, 0), (1, 2)])
@@ -612,7 +605,7 @@ def test_right_times_are_fitted_if_steps_are_long(longer: int, fitted: int, monk
     long = 2 * round(4.0 / RIG.dynamics.bending_frequency * 1000.0) + 100 + longer
     steps = [DotStep(at, 1.0, int(at), int(at) + long) for at in (3000.0, 8000.0)]
     between = with_pieces(monkeypatch, steps, {3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
-    assert correct_loads(RIG, np.zeros((20_000, 4)), annotated_at(3000, 8000)) is None
+    assert annotated_times.correct_loads(RIG, np.zeros((20_000, 4)), annotated_at(3000, 8000)) is None
     assert len(between) == fitted
 
 
@@ -629,13 +622,13 @@ def test_load_cell_noise_is_removed_for_any_times(monkeypatch: pytest.MonkeyPatc
     dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
     noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
     with_pieces(monkeypatch, [], {})
-    found = correct_loads(RIG, dots, noisy)
+    found = annotated_times.correct_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
     assert (found.notes, found.timed, found.unused.sum(), found.unused.shape) == ((), (), 0, (2000,))
     assert np.ptp(found.loads[:1500], axis=0).tolist() == [0.0] * 3
     with_pieces(monkeypatch, as_steps((400.0, 1e-4)), {400.0: (0.4, 0.0)})
-    found = correct_loads(RIG, dots, noisy)
+    found = annotated_times.correct_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
     assert [n.applied for n in found.notes] == [0.4]

@@ -428,6 +428,8 @@ def test_applied_load_is_single_change_of_doubled_note() -> None:
     assert note.exact
     assert note.applied.tolist() == APPLIED_ONCE.tolist()
     assert note.where == 'load 4'
+    words = replace(note, applied=np.array((20.126, -0.001, 17.5))).words('x')
+    assert words.endswith('(20.13 N, 0 N, 17.5 N m) hung, not (16 N, -20 N, 35 N m): note that')
     # One that others are like is what the readings say.
     other = observed({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
     (free,) = plateaus.wrong_notes_against(
