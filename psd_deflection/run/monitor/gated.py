@@ -207,7 +207,7 @@ class GatedServer(abc.ABC):
         finally:
             for task in tasks:
                 task.cancel()
-            # With aiohttp 3.9 a viewer that is being closed leaves the set at once, and its socket open.
+            # What a viewer has not read keeps its connection open; with aiohttp 3.9 it leaves the set as it is closed.
             connections = tuple(self._looked_through)
             leaving = [asyncio.create_task(v.close(code=WSCloseCode.GOING_AWAY)) for v in tuple(self.viewers)]
             if leaving:
@@ -217,7 +217,6 @@ class GatedServer(abc.ABC):
                     farewell.cancel()
                 await asyncio.gather(*leaving, return_exceptions=True)
             for connection in connections:
-                # What it has not read would keep the connection open.
                 if connection.transport is not None:
                     connection.transport.abort()
             await runner.cleanup()
