@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from psd_deflection.base.errors import EXIT_STATUSES
@@ -134,6 +135,9 @@ def test_its_examples_run(
     shutil.copy(ROOT / 'bags' / 'clean' / 'clean_0.mcap', tmp_path / 'lone.mcap')
     monkeypatch.chdir(tmp_path)
     assert main(['convert', 'bags/clean', '--out', 'run.csv']) == 0
+    table = np.loadtxt('run.csv', str, delimiter=',')
+    for name, columns in (('first', [0, 1, 2, 3]), ('second', [0, 4, 5, 6])):
+        np.savetxt(f'{name}.csv', table[:, columns], '%s', ',')
     if command == 'certificate':
         loads = 'steps:0,0,0;0,-40,-20;40,0,15;-40,30,0;0,40,20;-40,-30,-15;20,0,-20;0,0,0:1'
         words = ['--reference-noise', '1e-5,5e-4', '--effect', 'sensor_rotation,psd=2,angle=0.012']

@@ -11,7 +11,7 @@ estimates, dots, loads and losses with a layout, and cannot be read back.
   psd-deflection convert bags/lost_samples --out lost_samples.rrd
   psd-deflection convert run.csv --out run --params-file my_rig.yaml
   psd-deflection convert bags/clean --out part.csv --from 1 --to 2.5
-  psd-deflection convert first.csv second.csv --out run
+  psd-deflection convert first.csv second.csv --out joined
 
 Two CSVs are those of two loggers, each with some of the PSDs (t,x1,y1,sum1 and t,x2,y2,sum2) and a clock of its own.
 The time between the clocks is found from the motion. The recording is on the first clock; each of its samples is a

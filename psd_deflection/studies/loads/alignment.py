@@ -18,6 +18,9 @@ SKEW = 'channel_skew'
 """The effect of the catalogue that makes one PSD late."""
 REACH_S = 4.0
 """Longest time between two PSDs that is looked for, and a little more, s."""
+ALONE_S = 0.1
+"""Largest time between two PSDs that is believed where the noted loads tell no time, s: beside a channel that does not
+work the next push may pass for this one."""
 SURE = 3.0
 """Standard deviations by which another PSD than the first must agree better with the loads to be the one in time."""
 
@@ -80,6 +83,9 @@ def aligned(rig: Rig, volts: FloatArray, loads: FloatArray) -> tuple[FloatArray,
         return volts, ()
     on_first = _moved(volts, rows)
     notes = time_shift(link_motion(rig, loads), on_first[:, dot_channels(psds)], period, REACH_S)
+
+    if notes.unknown and max(map(abs, later)) > ALONE_S:
+        return volts, ()
 
     def off(k: int) -> tuple[int, float]:
         """PSDs that are not on the clock of PSD ``k``, and s by which the others then lag behind the loads."""

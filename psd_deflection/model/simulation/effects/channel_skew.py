@@ -22,6 +22,11 @@ def _steps(physics: Physics, values: Values) -> tuple[int, float]:
     return integer, max(integer - steps, 0.0)
 
 
+def _searched(physics: Physics, values: Values) -> tuple[float, float]:
+    # Earlier than the nearest sample is what studies.loads.alignment finds first; two early PSDs are late loads.
+    return -0.6 * physics.period, 4.0
+
+
 def _ahead(physics: Physics, values: Values) -> int:
     return max(-_steps(physics, values)[0], 0)
 
@@ -54,7 +59,7 @@ EFFECT = Effect(
     needs='fast motion (steps, sweeps)',
     parameters=(
         PSD,
-        EffectParameter('delay', 's', -4.0, 4.0, 1e-5, 'how late; below 0 how early'),
+        EffectParameter('delay', 's', -4.0, 4.0, 1e-5, 'how late; below 0 how early', within=_searched),
     ),
     point='volts',
     apply=_apply,
