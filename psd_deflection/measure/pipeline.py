@@ -3,6 +3,7 @@
 """From chunks of samples to records, by one class in the live run and in replay: no clock, thread or I/O, so the output
 is that of rig, samples and order of calls, bit for bit. Parts tell what they remember (:mod:`.state`)."""
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -47,6 +48,7 @@ from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.declarations import ZEROS
 
 ZERO_BLOCKS = 25
+ZERO_KEPT_S = 15.0
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
 
 
@@ -101,7 +103,8 @@ class Pipeline:
         """Make all parts that have a state anew."""
         self._effects = effects_of_rig(rig)
         self.tip_loads = TipLoads(rig, self._effects)
-        self._recent: list[Dots] = []
+        blocks = round(ZERO_KEPT_S * rig.converter.sample_rate_hz / rig.estimator.block_size)
+        self._recent: deque[tuple[int, Dots]] = deque(maxlen=ZERO_BLOCKS + blocks)
         self._surroundings = Surroundings()
         self._stillness = Stillness(len(rig.psds))
         self._loudness = Loudness()
@@ -175,21 +178,27 @@ class Pipeline:
         for block in self._cutter.flush():
             yield from self._together([block])
 
-    def zero(self) -> ParameterChange | None:
+    def zero(self, late_s: float = 0.0) -> ParameterChange | None:
         """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
 
-        None if there is no block, if the last one was not good, or if the link moves; in the last case
-        ``zero_rejected`` says so. Replay applies the returned record again.
+        ``late_s``: s for which the request was under way; its blocks end so long before the last one. None if there is
+        no block, if the last one was not good, or, with the reason in ``zero_rejected``, if the link moved or the
+        blocks of that time are not kept (``ZERO_KEPT_S``). Replay applies the returned record again.
         """
         self.zero_rejected = ''
         if not self._recent:
             return None
-        recent = np.array(self._recent)
+        until_ns = self._recent[-1][0] - round(1e9 * late_s)
+        dots = [dots for t_ns, dots in self._recent if t_ns <= until_ns][-ZERO_BLOCKS:]
+        if not dots:
+            self.zero_rejected = f'the request is {late_s:.1f} s old, and no good block of that time is kept; try again'
+            return None
+        recent = np.array(dots)
         noise = self.estimation.zero_noise(self._cutter.block_size)
         self.zero_rejected = why_moving(recent, noise)
         if self.zero_rejected:
             return None
-        means = [self._xp.total(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
+        means = [self._xp.total(column) / len(dots) for column in zip(*dots, strict=True)]
         values: dict[str, float | str | tuple[float, ...]] = dict(
             zip(ZEROS, zip(means[0::2], means[1::2], strict=True), strict=False)
         )
@@ -438,12 +447,12 @@ class Pipeline:
     def _keep_for_zero(self, observed: ValidBlock, answer: BlockSolution) -> None:
         """Keep the dots of the last good blocks; a zero must not be a mean across an outage."""
         if answer.estimate is None or answer.used is None or not answer.complete:
-            self._recent = []
+            self._recent.clear()
             return
         last = self.last_spots
         if last is not None and observed.t_ns - last.t_ns > ZERO_BLOCKS * self._cutter.block_size * self._period_ns:
-            self._recent = []
-        self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.readings.dots]
+            self._recent.clear()
+        self._recent.append((observed.t_ns, answer.used.readings.dots))
 
     def _findings(
         self, measures: BlockMeasures, observed: ValidBlock, answer: BlockSolution, status: BlockStatus

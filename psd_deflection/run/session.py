@@ -403,8 +403,8 @@ class Session:
 
         self.processing.request(change)
 
-    def zero(self) -> ParameterChange | None:
-        """Take the present dots as the unloaded ones; None if the last block is not good.
+    def zero(self, late_s: float = 0.0) -> ParameterChange | None:
+        """Take the dots of ``late_s`` s ago as the unloaded ones; None if the last block is not good.
 
         They are kept for the next run if the rig says so. Raises TimeoutError if no data flows, because the
         present dots are unknown then.
@@ -415,17 +415,17 @@ class Session:
         def change() -> ParameterChange | None:
             if self.acquisition.away or self.processing.silent_s() > patience:
                 raise TimeoutError('no data flows')
-            taken = self.pipeline.zero()
+            taken = self.pipeline.zero(late_s)
             if taken is not None:
                 self.processing.give([taken])
             return taken
 
         taken = self.processing.request(change)
         if taken is not None:
-            self._zeroed_ns = self.acquisition.now_ns()
+            self._zeroed_ns = self.acquisition.now_ns() - round(1e9 * late_s)
             self._report(zero_text(self.rig))
             self._keep_zero()
-            if self.load is not None and any(self.load[1:]):
+            if self.load is not None and any(self.load[1:]) and self.load.t_ns <= self._zeroed_ns:
                 self._report(f'the zero was taken under a load ({load_text(self.load)}): {RETAKE_ZERO}', WARNING)
         return taken
 

@@ -162,6 +162,23 @@ def test_a_zero_is_not_taken_across_an_outage(rig: Rig) -> None:
     assert why_no_zero(pipeline).startswith('no good block now: laser 1 lost')
 
 
+def test_a_late_request_takes_the_dots_of_its_own_time(rig: Rig) -> None:
+    pipeline, asked = Pipeline(rig), Pipeline(rig)
+    pose = (1e-4, -2e-4, 1e-3)
+    run(pipeline.process, chunk_of(still(REST, 600, 5)))
+    run(asked.process, chunk_of(still(REST, 600, 5)))
+    run(pipeline.process, chunk_of(still(pose, 1000, 6), 600))
+    late, in_time = pipeline.zero(1.0), asked.zero()
+    assert late is not None
+    assert in_time is not None
+    assert late.values == in_time.values
+    assert pipeline.zero(1.7) is None
+    assert why_no_zero(pipeline) == 'the request is 1.7 s old, and no good block of that time is kept; try again'
+    run(pipeline.process, chunk_of(still(pose, 16_000, 7), 1600))
+    assert pipeline.zero(15.4) is not None
+    assert pipeline.zero(15.6) is None
+
+
 def test_a_zero_forgets_what_was_before_an_unplugging(rig: Rig) -> None:
     pipeline = Pipeline(rig)
     pose = (1e-4, -2e-4, 1e-3)

@@ -89,6 +89,9 @@ def test_a_zero_that_was_taken_under_a_load_is_reported(running: Running) -> Non
     session.note_load(0.0, 0.0, 0.0)
     assert session.zero() is not None
     session.note_load(0.0, -30.0, 0.0)
+    # It came after the click on a zero that was long under way.
+    session.load = AppliedLoad(session.acquisition.now_ns() + 10**12, 0.0, -30.0, 0.0)
+    assert session.zero() is not None
     session.reject_input(LOAD, 'the end')
     reported = []
     while 'rejected: the end' not in (text := running.logged.get(timeout=WAIT_S)):

@@ -40,10 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Ask for it, again while the link moves."""
     end = time.monotonic() + args.wait
+    timed = True
     while True:
         try:
-            return request(args, 'api/zero', {})
+            return request(args, 'api/zero', {}, timed=timed)
         except DaemonError as error:
             if MOVES not in str(error) or time.monotonic() >= end:
                 raise
+        timed = False
         time.sleep(ASK_AGAIN_S)

@@ -352,8 +352,8 @@ class MonitorServer(GatedServer):
 
     async def _zero(self, request: web.Request) -> web.StreamResponse:
         def zero(body: dict[str, Any]) -> Awaitable[str]:
-            _need(not body, '{}')
-            return asyncio.to_thread(self._shown.zero)
+            _need(body.keys() <= {'late'}, '{"late": s}')
+            return asyncio.to_thread(self._shown.zero, _late(body))
 
         return await self._act(request, 'zero', zero)
 

@@ -44,8 +44,8 @@ class Shown(Protocol):
     def metrics(self) -> list[Family]:
         """What was counted since the start."""
 
-    def zero(self) -> str:
-        """Take the present dots as the unloaded ones; return the result as a line. Raises RejectedError."""
+    def zero(self, late_s: float) -> str:
+        """Take the dots of ``late_s`` s ago as the unloaded ones; return the result as a line. Raises RejectedError."""
 
     async def record(self, wanted: bool) -> str:
         """Start or stop a recording; return the result as a line once the disk has answered. Raises RejectedError."""
@@ -105,10 +105,10 @@ class ShownSession:
         """Of the session."""
         return of_session(self._session)
 
-    def zero(self) -> str:
+    def zero(self, late_s: float) -> str:
         """Take the zero between two blocks."""
         try:
-            change = self._session.zero()
+            change = self._session.zero(late_s)
         except (TimeoutError, PsdDeflectionError) as error:
             raise RejectedError(f'not zeroed: {error}') from None
         if change is None:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from psd_deflection.base.errors import PsdDeflectionError
@@ -189,11 +190,11 @@ class ShownRecording:
         """Of the part that was played."""
         return of_pipeline(self._pipeline)
 
-    def zero(self) -> str:
+    def zero(self, late_s: float) -> str:
         """Take the zero between two blocks; it holds for the rest of the playback."""
         if self._ended or self._thread.ident is None:
             raise RejectedError('not zeroed: the recording has ended')
-        return self._between_blocks(self._take_zero, 'not zeroed: no data flows')
+        return self._between_blocks(partial(self._take_zero, late_s), 'not zeroed: no data flows')
 
     async def record(self, wanted: bool) -> str:
         """Reject: a recording is not recorded again."""
@@ -245,8 +246,8 @@ class ShownRecording:
             # It was begun at this very moment: its answer is the true one.
             return asked.result(REQUEST_TIMEOUT_S)
 
-    def _take_zero(self) -> str:
-        change = self._pipeline.zero()
+    def _take_zero(self, late_s: float) -> str:
+        change = self._pipeline.zero(late_s)
         if change is None:
             raise RejectedError(f'not zeroed: {why_no_zero(self._pipeline)}')
         self._feed.put(change)

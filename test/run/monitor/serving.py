@@ -54,7 +54,8 @@ class StillShown:
     def metrics(self) -> list[Family]:
         return [counter('samples', 'Samples that came', 40)]
 
-    def zero(self) -> str:
+    def zero(self, late_s: float) -> str:
+        self.lates.append(late_s)
         if self.rejection:
             raise RejectedError(self.rejection)
         self.zeros += 1

@@ -45,8 +45,8 @@ def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest
     assert serving.shown.agos == [0.0, 0.0, 3.4, None]
     assert main(['mark', 'bumped', 'it']) == 0
     assert serving.shown.marks == ['bumped it']
-    # Four loads and a mark, of the time at which this program was started.
-    assert len(serving.shown.lates) == 5
+    # A zero, four loads and a mark, of the time at which this program was started.
+    assert len(serving.shown.lates) == 6
     assert 0.0 < serving.shown.lates[0] < serving.shown.lates[-1]
     assert serving.shown.zeros == 1
     assert serving.shown.recordings == ['recordings/test', None]
@@ -91,6 +91,7 @@ def test_zero_waits_for_a_link_that_moves(
     monkeypatch.setattr('psd_deflection.cli.run.zero.time.sleep', rests)
     assert main(['zero']) == 0
     assert len(waited) == 3
+    assert serving.shown.lates[1] > 0.0 == serving.shown.lates[-1]  # It waited for the rest: that is of its end.
     assert capsys.readouterr() == ('unloaded dots taken\n', '')
 
 

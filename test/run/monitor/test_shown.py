@@ -71,7 +71,7 @@ def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
     assert ('lost', '176') in report.entries[0].values
     assert report.entries[0].message == 'end of the recording'
     with pytest.raises(RejectedError, match='has ended'):
-        source.zero()
+        source.zero(0.0)
     with pytest.raises(RejectedError, match='not recorded again'):
         asyncio.run(source.record(True))
     assert wanted == ['lost_samples: end of the recording']
@@ -96,7 +96,7 @@ def test_zero_is_not_delayed_by_slow_recording() -> None:
     source = source_of('clean', feed, stated, threading.Event(), speed=1e-3)
     source.start()
     assert feed.estimated.wait(60.0)
-    reported = source.zero()
+    reported = source.zero(0.0)
     source.close()
     assert reported.startswith('unloaded dots (mm): psd_1 (')
     assert stated == [reported]

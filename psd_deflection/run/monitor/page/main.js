@@ -379,7 +379,7 @@ function showPosition() {
   }
 }
 
-const TIMED = ['/api/mark', '/api/load'];
+const TIMED = ['/api/mark', '/api/load', '/api/zero'];
 
 function notice(text, bad = false) {
   $('notice').textContent = text;
