@@ -190,13 +190,13 @@ def test_dots_that_lie_on_one_another_turn_nothing() -> None:
     assert got.status.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize('count', [2, 4098])
-def test_of_many_blocks_each_has_its_own_variances(rays: Any, count: int) -> None:
+@pytest.mark.parametrize(('method', 'count'), [('exact', 2), ('exact', 4098), ('iterative', 2)])
+def test_of_many_blocks_each_has_its_own_variances(rays: Any, method: str, count: int) -> None:
     """More of them than are worked on at once, too."""
     rng = np.random.default_rng(6)
     dots = rays.tip_dots(SKEW, (1e-3, 2e-3, 0.02, 0.0, 0.0)) + rng.normal(size=(count, 4)) * 1e-4
     variances = rng.uniform(1.0, 9.0, (count, 4)) * 1e-12
-    solver = make_solver('exact', SKEW)
+    solver = make_solver(method, SKEW)
     many = solver.solve_many(dots, variances)
     for i in {0, 1, count - 2, count - 1}:
         one = solver.solve(tuple(dots[i].tolist()), tuple(variances[i].tolist()))

@@ -100,7 +100,7 @@ def test_right_times_and_small_delay_are_unchanged(loads: FloatArray) -> None:
     assert corrected(ROTATED, loads) is None
 
 
-@pytest.mark.parametrize(('psd', 'rows'), [(1, 40), (2, 8), (2, -40)])
+@pytest.mark.parametrize(('psd', 'rows'), [(1, 40), (2, 8), (2, -40), (2, 3000)])
 def test_the_psd_that_agrees_with_the_loads_stays(psd: int, rows: int) -> None:
     late, n = slice(3 * psd - 3, 3 * psd), COUNT - abs(rows)
     read, loads = QUIET[max(rows, 0) :][:n].copy(), applied()[max(rows, 0) :][:n]

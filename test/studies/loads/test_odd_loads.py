@@ -133,6 +133,7 @@ def test_a_swing_is_what_no_constant_load_explains() -> None:
     # Of two lost holds nothing is known, and what is less than eight times the median is no sway.
     lost = rest.copy()
     lost[:, n // size : 3 * n // size] = np.nan
+    lost[:, -900:-890] = np.nan
     lost[1, n:] += 2e-6 * np.tile(force, 2).reshape(-1, size).mean(axis=1)
     implied = dataclasses.replace(implied, rest=lost)
     assert [s.plateau for s in effective.swaying(implied, held, lambda _: implied, 1e-3)] == [held[3]]

@@ -276,6 +276,7 @@ def test_a_faulty_detector_is_no_wrong_note() -> None:
     far_off = plateaus.outliers(observed({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
     assert not plateaus.closes(observed({}))
+    assert plateaus.closes(replace(observed(wrong), rest=np.ones((3, 80)) * [[1e-3], [0.0], [2e-3]]))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
         assert plateaus.outliers(observed(wrong, left=left), bent).gone == gone
 
