@@ -263,10 +263,10 @@ def cloud(
     """PointCloud2 fields with any layout that has our eight names."""
     kinds = {'u4': 6, 'f4': 7, 'f8': 8, 'u2': 4}
     order = '>' if big else '<'
-    kinds_of = [formats.get(n, 'f4') for n in names]
-    offsets = [4 + sum(int(kind[1]) for kind in kinds_of[:i]) for i in range(len(names))]
-    layout = {'names': list(names), 'formats': [order + kind for kind in kinds_of], 'offsets': offsets}
-    dtype = np.dtype({**layout, 'itemsize': step})
+    own = [formats.get(n, 'f4') for n in names]
+    offsets = [4 + sum(int(kind[1]) for kind in own[:i]) for i in range(len(names))]
+    ordered = [order + kind for kind in own]
+    dtype = np.dtype({'names': list(names), 'formats': ordered, 'offsets': offsets, 'itemsize': step})
     points = np.zeros(len(b.seq), dtype)
     points['seq'] = b.seq
     points['dt'] = b.t_ns - b.t_ns[0]
@@ -278,7 +278,7 @@ def cloud(
         'header': {**message.fields['header'], 'frame_id': 'some_other_frame'},
         'fields': [
             {'name': n, 'offset': o, 'datatype': kinds[kind], 'count': 1}
-            for n, o, kind in zip(names, offsets, kinds_of, strict=True)
+            for n, o, kind in zip(names, offsets, own, strict=True)
         ],
         'is_bigendian': big,
         'point_step': step,
