@@ -549,7 +549,7 @@ def test_recording_holds_up_the_end_for_limited_time(
 
 
 @pytest.fixture
-def hung(
+def stalled(
     hanging_disk: HangingDisk, device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Live:
     """A run that has begun with a recording for which the disk hangs."""
@@ -560,26 +560,26 @@ def hung(
     return one
 
 
-def test_a_disk_that_hangs_does_not_hold_up_the_start_of_a_run(hanging_disk: HangingDisk, hung: Live) -> None:
-    hung.heard('the disk does not answer; the recording begins when it does')
-    hung.flow()
+def test_a_disk_that_hangs_does_not_hold_up_the_start_of_a_run(hanging_disk: HangingDisk, stalled: Live) -> None:
+    stalled.heard('the disk does not answer; the recording begins when it does')
+    stalled.flow()
     hanging_disk.go_on.set()
-    hung.heard('recording to')
-    hung.flow()
-    folder = hung.session.close()
+    stalled.heard('recording to')
+    stalled.flow()
+    folder = stalled.session.close()
     assert folder is not None
     assert blocks_of(folder) == list(range(BLOCKS, 2 * BLOCKS))
 
 
-def test_a_late_disk_error_is_reported(hanging_disk: HangingDisk, hung: Live, tmp_path: Path) -> None:
+def test_a_late_disk_error_is_reported(hanging_disk: HangingDisk, stalled: Live, tmp_path: Path) -> None:
     hanging_disk.await_reached()
     (folder,) = (tmp_path / 'bags').iterdir()
     folder.rmdir()
     hanging_disk.go_on.set()
-    assert 'No such file' in hung.heard('not recorded: ')
-    assert 'No such file' in hung.session.recorder.failure
-    hung.flow()
-    hung.session.close()
+    assert 'No such file' in stalled.heard('not recorded: ')
+    assert 'No such file' in stalled.session.recorder.failure
+    stalled.flow()
+    stalled.session.close()
 
 
 def test_a_disk_that_rejects_at_once_ends_the_start(device: ScriptedDevice, sample: Sample, tmp_path: Path) -> None:
