@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``budget``, ``design`` and ``certificate``: what they print, draw and reject; the tables alone give every U."""
 
+import contextlib
 import csv
 import json
 import math
@@ -17,11 +18,15 @@ from psd_deflection.studies.budget.inputs import INPUTS
 RIG = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
 
 
+def rig_file(folder: Path, line: str) -> str:
+    (folder / 'rig.yaml').write_text(f'/**:\n  ros__parameters:\n    {line}\n')
+    return str(folder / 'rig.yaml')
+
+
 @pytest.mark.slow
 def test_a_rig_without_room_says_which_dot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / 'rig.yaml'
-    path.write_text('/**:\n  ros__parameters:\n    psd_1: {active_area: [0.004, 0.004], zero: [0.0, 0.003]}\n')
-    assert main(['budget', '--params-file', str(path)]) == 3
+    path = rig_file(tmp_path, 'psd_1: {active_area: [0.004, 0.004], zero: [0.0, 0.003]}')
+    assert main(['budget', '--params-file', path]) == 3
     assert 'psd_1 would lie at y = 3.00 mm, outside its ±2 mm' in capsys.readouterr().err
 
 
@@ -57,9 +62,7 @@ def test_everything_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.slow
 def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    solver: wls\n')
-    assert main(['budget', '--params-file', str(rig), '--json']) == 0
+    assert main(['budget', '--params-file', rig_file(tmp_path, 'solver: wls'), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['method'] == 'wls'
 
 
@@ -83,11 +86,10 @@ def test_programs_get_the_same_placements_in_si_units(capsys: pytest.CaptureFixt
 
 
 def test_sensors_on_one_spot_are_unseen_not_a_crash(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    psd_2:\n      center: [0.0, 0.07]\n')
-    assert main(['design', '--params-file', str(rig)]) == 0
+    rig = rig_file(tmp_path, 'psd_2: {center: [0.0, 0.07]}')
+    assert main(['design', '--params-file', rig]) == 0
     assert 'unseen' in capsys.readouterr().out
-    assert main(['design', '--params-file', str(rig), '--json']) == 0
+    assert main(['design', '--params-file', rig, '--json']) == 0
     assert json.loads(capsys.readouterr().out)['placements'][0]['sd'] == {'dx': None, 'dy': None, 'theta': None}
 
 
@@ -151,21 +153,15 @@ def test_the_page_has_the_same_numbers(certified: Path) -> None:
         (['--limit', 'inf', '0', '0'], 2, 'finite'),
         (['--set', 'reference_scal=1'], 2, 'did you mean reference_scale'),
         (['--fields', 'absent.yaml'], 3, 'absent.yaml'),
+        (['--fields', 'fields.yaml'], 3, 'psd1: no such field; did you mean psd_1'),
     ],
 )
 def test_certificate_rejects_bad_input_in_one_line(
     more: list[str], status: int, words: str, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(['certificate', str(calibrated), '--out', str(tmp_path), *more]) == status
+    (tmp_path / 'fields.yaml').write_text('psd1: S1880\n')
+    with contextlib.chdir(tmp_path):
+        assert main(['certificate', str(calibrated), '--out', str(tmp_path), *more]) == status
     error = capsys.readouterr().err
     assert words in error
     assert error.count('\n') == 1
-
-
-def test_a_field_that_there_is_not_is_named(
-    calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fields = tmp_path / 'fields.yaml'
-    fields.write_text('psd1: S1880\n')
-    assert main(['certificate', str(calibrated), '--out', str(tmp_path), '--fields', str(fields)]) == 3
-    assert 'psd1: no such field; did you mean psd_1' in capsys.readouterr().err

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: help that teaches, options, completion, effects, one clear line for what goes wrong."""
 
-import argparse
 import json
 import re
 import shlex
@@ -10,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,10 +25,11 @@ from psd_deflection.run.simulated_rig import SimulatedRigProcess, started_early
 
 ROOT = Path(__file__).parent.parent.parent
 BAGS = ROOT / 'bags'
+Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(('typed', 'hint'), [('inf', 'did you mean info?'), ('frobnicate', '--help` lists them')])
-def test_an_unknown_command_is_one_line_with_a_hint(typed: str, hint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_command_is_one_line_with_a_hint(typed: str, hint: str, capsys: Capsys) -> None:
     assert main([typed]) == 2
     out, err = capsys.readouterr()
     assert out == ''
@@ -46,28 +47,21 @@ def test_an_unknown_command_is_one_line_with_a_hint(typed: str, hint: str, capsy
         (['info', 'x', '--xyzzy'], 'unrecognized arguments: --xyzzy\n'),
     ],
 )
-def test_an_option_that_is_mistyped_is_named_with_the_nearest(
-    argv: list[str], hint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_option_that_is_mistyped_is_named_with_the_nearest(argv: list[str], hint: str, capsys: Capsys) -> None:
     with pytest.raises(SystemExit):
         main(argv)
     assert hint in capsys.readouterr().err
 
 
 def test_ros_arguments_go_through_untouched(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[list[str]] = []
-
-    def run(args: argparse.Namespace) -> int:
-        taken.append(args.ros_arguments)
-        return 0
-
+    run = Mock(return_value=0)
     monkeypatch.setattr('psd_deflection.cli.run.estimator.run', run)
     ros = ['--ros-args', '-p', 'port:=/dev/ttyACM0', '--remap', 'a:=b', '--no-such-option']
     assert main(['estimator', *ros]) == 0
-    assert taken == [ros]
+    assert [call.args[0].ros_arguments for call in run.call_args_list] == [ros]
 
 
-def test_params_lists_each_with_unit_and_bounds(capsys: pytest.CaptureFixture[str]) -> None:
+def test_params_lists_each_with_unit_and_bounds(capsys: Capsys) -> None:
     assert main(['params']) == 0
     out = capsys.readouterr().out
     assert 'link.length = 0.585 m' in out
@@ -83,26 +77,26 @@ ENDLESS = (
 """Examples that go on until Ctrl-C, take long, or want a device or a reference: only their options are parsed."""
 
 
-def help_of(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int) -> str:
+def help_of(command: str, capsys: Capsys, monkeypatch: pytest.MonkeyPatch, columns: int) -> str:
     monkeypatch.setenv('COLUMNS', str(columns))
     with pytest.raises(SystemExit):
         main([command, '--help'] if command else ['--help'])
     return capsys.readouterr().out
 
 
-def test_it_reports_the_exit_statuses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_reports_the_exit_statuses(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     text = ' '.join(help_of('', capsys, monkeypatch, 80).split())
     reported = re.findall(r'(\d+) [a-zC]', text.partition('exit status: ')[2])
     assert [int(status) for status in reported] == list(EXIT_STATUSES)
 
 
-def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_argument_prints_help(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     reported = help_of('', capsys, monkeypatch, 80)
     assert main([]) == 0
     assert capsys.readouterr().out == reported
 
 
-def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_short_list_of_parameters_is_short(capsys: Capsys) -> None:
     assert main(['params', '--short']) == 0
     named = re.findall(r'^(\S+) = ', capsys.readouterr().out, re.M)
     assert set(named) == set(NEEDED)
@@ -110,13 +104,13 @@ def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str
     assert set(json.loads(capsys.readouterr().out)) == set(NEEDED)
 
 
-def test_json_is_named_on_the_page(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_is_named_on_the_page(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     words = (ROOT / 'docs' / 'commands.md').read_text().partition('take `--json`')[0].rpartition('standard error. ')[2]
     named = {command for command in COMMANDS if re.search(f'`{command}[` ]', words)}
     assert {command for command in COMMANDS if '--json' in help_of(command, capsys, monkeypatch, 80)} == named
 
 
-def examples(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def examples(command: str, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The command lines that its help shows, without what is said beside them."""
     lines = help_of(command, capsys, monkeypatch, 80).splitlines()
     return [re.split(r' {2,}', line.strip())[0] for line in lines if line.startswith(f'  {OURS}')]
@@ -124,9 +118,7 @@ def examples(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pyte
 
 @pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
-def test_its_examples_run(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_its_examples_run(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
     found = examples(command, capsys, monkeypatch)
     assert found
     for link, target in (('bags', 'bags'), ('config', 'config'), ('my_rig.yaml', 'config/thesis_rig.yaml')):
@@ -154,7 +146,7 @@ def test_its_examples_run(
         assert main(argv) in ((0, 1) if '--compare' in argv else (0,)), line
 
 
-def test_the_list_has_every_effect(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_has_every_effect(capsys: Capsys) -> None:
     assert main(['effects']) == 0
     lines = capsys.readouterr().out.splitlines()
     for name, effect in catalogue().items():
@@ -162,9 +154,7 @@ def test_the_list_has_every_effect(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize('name', catalogue())
-def test_an_effect_is_explained_with_a_command_that_runs(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_effect_is_explained_with_a_command_that_runs(name: str, tmp_path: Path, capsys: Capsys) -> None:
     assert main(['effects', name]) == 0
     text = capsys.readouterr().out
     effect = catalogue()[name]
@@ -179,7 +169,7 @@ def test_an_effect_is_explained_with_a_command_that_runs(
     assert name in capsys.readouterr().out
 
 
-def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> None:
+def test_programs_get_the_declaration(capsys: Capsys) -> None:
     assert main(['effects', 'sensor_rotation', '--json']) == 0
     found = json.loads(capsys.readouterr().out)['sensor_rotation']
     assert found['corrected'] == 'reading'
@@ -187,7 +177,7 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
     assert found['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_wrong_name_is_reported_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_name_is_reported_with_the_right_one(capsys: Capsys) -> None:
     assert main(['effects', 'sensor_rotatoin']) == 2
     assert 'did you mean sensor_rotation' in capsys.readouterr().err
 

@@ -89,13 +89,8 @@ def test_info_of_what_has_no_samples(tmp_path: Path, capsys: pytest.CaptureFixtu
     BagWriter(tmp_path / 'empty', rig_values={}).close()
     assert main(['info', str(tmp_path / 'empty')]) == 0
     text = capsys.readouterr().out
-    for part in (
-        'samples      none',
-        'lacks        samples (/psd/samples)',
-        ' parameters: the nominal',
-        'what the device says of itself',
-        ' known loads',
-    ):
+    parts = ('samples      none', 'lacks        samples (/psd/samples)', ' parameters: the nominal')
+    for part in (*parts, 'what the device says of itself', ' known loads'):
         assert part in text
     assert main(['info', str(tmp_path / 'empty'), '--json']) == 0
     assert len(json.loads(capsys.readouterr().out)['lacks']) == 5
@@ -190,15 +185,6 @@ def test_a_name_that_is_markup_is_text(tmp_path: Path) -> None:
     assert main(['plot', str(recording), '--out', str(out)]) == 0
     assert '<b>' not in out.read_text()
     assert '&lt;b&gt;&amp;&quot;x&quot;.csv</title>' in out.read_text()
-
-
-@pytest.fixture(scope='module')
-def loaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds at rest, then two load cases of a second, with the true pose beside."""
-    out = tmp_path_factory.mktemp('loaded') / 'run'
-    loads = 'steps:0,0,0;0,0,0;0,-10,-5.85;10,0,0:1'
-    assert main(['simulate', '--out', str(out), '--loads', loads, '--reference']) == 0
-    return out
 
 
 def test_losses_and_missing_estimates_are_marked() -> None:

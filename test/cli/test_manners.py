@@ -14,6 +14,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from mcap.writer import Writer
@@ -33,6 +34,8 @@ RIG = str(ROOT / 'config' / 'thesis_rig.yaml')
 CHAIN = str(ROOT / 'config' / 'two_links.yaml')
 URDF = str(ROOT / 'config' / 'two_links.urdf')
 SHORT = ('--loads', 'constant:0,-10,0:0.1')
+CSV_SINK = 'psd_deflection.recordings.write.csv_writer.CsvSampleSink.put'
+Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +45,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def rejected(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
+def rejected(capsys: Capsys, *argv: str) -> tuple[int, str]:
     """Exit status and the one line of error; nothing else is said."""
     status = main(list(argv))
     out, err = capsys.readouterr()
@@ -183,7 +186,7 @@ REJECTED_SLOWLY: list[tuple[list[str], int, str]] = [
     ids=lambda v: ' '.join(v)[-60:] if isinstance(v, list) else '',
 )
 def test_what_cannot_be_asked_for_is_one_line(
-    argv: list[str], status: int, message: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    argv: list[str], status: int, message: str, folder: Path, capsys: Capsys
 ) -> None:
     (folder / 'taken').touch()
     ended, err = rejected(capsys, *argv)
@@ -194,9 +197,7 @@ def test_what_cannot_be_asked_for_is_one_line(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('command', 'also'), [('convert', '.rrd'), ('replay', '.rrd .parquet'), ('simulate', '')])
-def test_recording_name_of_foreign_suffix_is_rejected(
-    command: str, also: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recording_name_of_foreign_suffix_is_rejected(command: str, also: str, folder: Path, capsys: Capsys) -> None:
     arguments = [] if command == 'simulate' else [CLEAN]
     for suffix in sorted(FOREIGN - {*also.split()}):
         for name in (f'run{suffix}', f'run_0.5N{suffix.upper()}'):
@@ -238,9 +239,7 @@ def bad_from_row(folder: Path, row: int) -> Path:
 
 @pytest.mark.parametrize('name', ['out.csv', 'out.mcap', 'out'])
 @pytest.mark.parametrize('command', ['convert', 'replay'])
-def test_unfinished_output_stays_partial(
-    command: str, name: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unfinished_output_stays_partial(command: str, name: str, folder: Path, capsys: Capsys) -> None:
     bad = bad_from_row(folder, 2000)
     for partial in (f'{name}.partial', f'{name}.partial2'):
         status, err = rejected(capsys, command, str(bad), '--out', name)
@@ -266,24 +265,16 @@ def signals() -> Iterator[None]:
 @pytest.mark.parametrize(
     ('argv', 'sink'),
     [
-        (['simulate', '--loads', 'thesis'], 'psd_deflection.recordings.write.csv_writer.CsvSampleSink.put'),
-        (['convert', CLEAN], 'psd_deflection.recordings.write.csv_writer.CsvSampleSink.put'),
+        (['simulate', '--loads', 'thesis'], CSV_SINK),
+        (['convert', CLEAN], CSV_SINK),
         (['replay', CLEAN], 'psd_deflection.cli.recordings.replay.Totals.add'),
     ],
     ids=lambda v: v[0] if isinstance(v, list) else '',
 )
 def test_ctrl_c_leaves_no_output_that_looks_whole(
-    argv: list[str],
-    sink: str,
-    number: signal.Signals,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    argv: list[str], sink: str, number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
-    def interrupted(self: object, record: object) -> None:
-        signal.raise_signal(number)
-
-    monkeypatch.setattr(sink, interrupted)
+    monkeypatch.setattr(sink, lambda *_: signal.raise_signal(number))
     before = signal.getsignal(number)
     assert main([*argv, '--out', 'out.csv']) == 130
     assert signal.getsignal(number) is before
@@ -299,9 +290,7 @@ class Finalised:
 
 
 @pytest.mark.usefixtures('signals')
-def test_ctrl_c_that_python_drops_comes_again(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_that_python_drops_comes_again(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
     dropped: list[object] = []
 
     def put(self: object, record: object) -> None:
@@ -312,7 +301,7 @@ def test_ctrl_c_that_python_drops_comes_again(
         # Nothing ends this but the interrupt.
         threading.Event().wait(60.0)
 
-    monkeypatch.setattr('psd_deflection.recordings.write.csv_writer.CsvSampleSink.put', put)
+    monkeypatch.setattr(CSV_SINK, put)
     before = sys.unraisablehook
     assert main(['convert', CLEAN, '--out', 'out.csv']) == 130
     assert dropped
@@ -321,17 +310,12 @@ def test_ctrl_c_that_python_drops_comes_again(
     assert [p.name for p in folder.iterdir()] == ['out.csv.partial']
 
 
-def test_an_existing_output_is_not_moved(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(args: object) -> int:
-        raise KeyboardInterrupt
-
+def test_an_existing_output_is_not_moved(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
     out = folder / 'out.csv'
     out.write_text('mine')
     status, err = rejected(capsys, 'convert', CLEAN, '--out', 'out.csv')
     assert (status, 'never overwritten' in err) == (4, True)
-    monkeypatch.setattr('psd_deflection.cli.recordings.simulate.run', interrupted)
+    monkeypatch.setattr('psd_deflection.cli.recordings.simulate.run', Mock(side_effect=KeyboardInterrupt))
     for name in ('out.csv', 'none.csv'):
         assert main(['simulate', '--out', name]) == 130
         assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
@@ -340,7 +324,7 @@ def test_an_existing_output_is_not_moved(
 
 
 @pytest.mark.skipif('discover' not in COMMANDS, reason='an optional room')
-def test_discover_without_input_leaves_no_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_discover_without_input_leaves_no_folder(folder: Path, capsys: Capsys) -> None:
     assert rejected(capsys, 'discover', CLEAN, '--out', 'found')[0] == 4
     assert list(folder.iterdir()) == []
 
@@ -352,11 +336,7 @@ def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.Monke
     _report.save(b'new', link)
     assert place.read_bytes() == b'new'
     assert link.is_symlink()
-
-    def full(number: int) -> None:
-        raise OSError(28, 'No space left on device')
-
-    monkeypatch.setattr(os, 'fsync', full)
+    monkeypatch.setattr(os, 'fsync', Mock(side_effect=OSError(28, 'No space left on device')))
     with pytest.raises(RecordingError, match=r'^--out .*a\.png: cannot be written \(No space left on device\)$'):
         _report.save(b'newer', place)
     assert sorted(folder.iterdir()) == [place, link]
@@ -366,13 +346,8 @@ def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.Monke
 def program(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """``line`` in a shell, with PROGRAM as our program; a pipe's status is that of the program."""
     command = line.replace('PROGRAM', f'"{sys.executable}" -m psd_deflection')
-    return subprocess.run(
-        ['bash', '-o', 'pipefail', '-c', command],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, 'PYTHONPATH': str(ROOT), **environment},
-    )
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT), **environment}
+    return subprocess.run(['bash', '-o', 'pipefail', '-c', command], capture_output=True, text=True, env=environment)
 
 
 @pytest.mark.parametrize('unbuffered', ['', '1'], ids=['buffered', 'unbuffered'])
@@ -402,12 +377,10 @@ def test_a_closed_standard_error_keeps_the_exit_status(where: str, folder: Path)
     (folder / 'cut.mcap').write_bytes(Path(CLEAN, 'clean_0.mcap').read_bytes()[:100_000])
     done = program(f'PROGRAM replay nowhere {where}')
     assert (done.returncode, done.stdout) == (4, '')
-    done = program(f'PROGRAM replay {CLEAN} --json {where}')
-    assert done.returncode == 0
-    assert strict(done.stdout)['samples'] == 4000
-    done = program('PROGRAM replay cut.mcap --json 2>&-')
-    assert done.returncode == 0
-    assert strict(done.stdout)['samples'] > 1000
+    for what, least in ((f'{CLEAN} --json {where}', 4000), ('cut.mcap --json 2>&-', 1001)):
+        done = program(f'PROGRAM replay {what}')
+        assert done.returncode == 0
+        assert least <= strict(done.stdout)['samples'] <= 4000
 
 
 def test_no_letter_is_missing_so_much_that_it_fails() -> None:
@@ -468,7 +441,7 @@ def odd_recording(folder: Path) -> Path:
     ids=' '.join,
 )
 def test_json_is_all_that_is_on_stdout(
-    argv: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    argv: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     # Whatever this machine has is not for a test to speak to.
     monkeypatch.setattr('serial.tools.list_ports.comports', list)
@@ -501,23 +474,17 @@ def test_json_is_all_that_is_on_stdout(
     [(MemoryError(), 'too little memory'), (RuntimeError("can't start new thread"), 'no further thread')],
 )
 def test_a_machine_that_gives_no_more_is_one_line(
-    error: Exception, why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception, why: str, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', fail)
+    monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', Mock(side_effect=error))
     assert main(['info', 'x.csv']) == 71
     output = capsys.readouterr().err
-    assert why in output
-    assert output.count('\n') == 1
+    assert (why in output, output.count('\n')) == (True, 1)
 
 
 def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise RuntimeError('a defect')
-
-    monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', fail)
+    defect = Mock(side_effect=RuntimeError('a defect'))
+    monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', defect)
     with pytest.raises(RuntimeError, match='a defect'):
         main(['info', 'x.csv'])
 
@@ -538,12 +505,6 @@ def test_micrometres_use_one_symbol_in_all_texts() -> None:
     assert wrong == []
 
 
-def rig_file(folder: Path, body: str) -> str:
-    path = folder / 'rig.yaml'
-    path.write_text(f'/**:\n  ros__parameters:\n    {body}\n')
-    return str(path)
-
-
 @pytest.mark.parametrize(
     ('body', 'status', 'message'),
     [
@@ -555,26 +516,23 @@ def rig_file(folder: Path, body: str) -> str:
     ],
 )
 def test_params_rejects_a_rig_that_cannot_be_evaluated(
-    body: str, status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    body: str, status: int, message: str, folder: Path, capsys: Capsys
 ) -> None:
-    assert main(['params', '--params-file', rig_file(tmp_path, body)]) == status
-    out, err = capsys.readouterr()
-    assert out == ''
+    (folder / 'rig.yaml').write_text(f'/**:\n  ros__parameters:\n    {body}\n')
+    ended, err = rejected(capsys, 'params', '--params-file', 'rig.yaml')
+    assert ended == status
     assert message in err
 
 
-def test_a_recording_with_a_typing_error_is_found(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['info', str(ROOT / 'bags' / 'cleann')]) == 4
-    assert capsys.readouterr().err.endswith('cleann: no such recording; did you mean clean?\n')
-    assert main(['info', '/nowhere/at/all']) == 4
-    assert capsys.readouterr().err.endswith('/nowhere/at/all: no such recording\n')
+def test_a_recording_with_a_typing_error_is_found(capsys: Capsys) -> None:
+    for name, words in ((f'{CLEAN}n', '; did you mean clean?'), ('/nowhere/at/all', '')):
+        status, err = rejected(capsys, 'info', name)
+        assert (status, err.endswith(f'{name}: no such recording{words}\n')) == (4, True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('command', ['replay', 'plot'])
-def test_how_long_a_recording_lasts_is_by_its_stamps(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_how_long_a_recording_lasts_is_by_its_stamps(command: str, tmp_path: Path, capsys: Capsys) -> None:
     """At 200 Hz, with the rig file of 1000 Hz."""
     path = tmp_path / 'run.csv'
     rows = '\n'.join(f'{i / 200:.3f},0.0{i % 7},0.0{i % 5},5,0.0{i % 3},0.0{i % 4},5' for i in range(400))
@@ -585,7 +543,6 @@ def test_how_long_a_recording_lasts_is_by_its_stamps(
     assert found['seconds' if command == 'replay' else 'duration_s'] == pytest.approx(2.0)
 
 
-CLEAN_BAG = Path(__file__).parent.parent.parent / 'bags' / 'clean'
 ESCAPE = '\x1b[31mred\x1b]0;title\x07\nstate complete'
 
 
@@ -594,7 +551,7 @@ def clean_of(text: str) -> None:
     assert '\nstate complete' not in text
 
 
-def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
     def opened(path: Path, namespace: str | None = None, **_: object) -> Recording:
         recording = info_of(path)
         recording.hello = {'serial': ESCAPE, ESCAPE: '\ud800', 'firmware': 'x' * 10_000}
@@ -604,37 +561,30 @@ def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, caps
 
     info_of = open_recording
     monkeypatch.setattr(info, 'open_recording', opened)
-    assert main(['info', str(CLEAN_BAG)]) == 0
+    assert main(['info', CLEAN]) == 0
     out = capsys.readouterr().out
     clean_of(out)
     assert '\\x1b[31mred' in out
 
 
 @pytest.mark.slow
-def test_names_of_files_reach_the_terminal_in_printable_lines(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_of_files_reach_the_terminal_in_printable_lines(tmp_path: Path, capsys: Capsys) -> None:
     copy = tmp_path / 'copy\x1b[31m\nstate complete'
-    shutil.copytree(CLEAN_BAG, copy)
+    shutil.copytree(CLEAN, copy)
     (copy / 'metadata.yaml').unlink()
-    for command in (
-        ['recover', str(copy)],
-        ['replay', str(copy), '--out', str(copy) + '.csv'],
-        ['convert', str(copy), '--out', str(copy) + '.mcap'],
-        ['plot', str(copy), '--out', str(copy) + '.svg'],
-    ):
-        assert main(command) == 0
-        output = capsys.readouterr()
-        clean_of(output.out)
-        assert '\\x1b[31m\\nstate' in output.out, command
+    for command, suffix in (('recover', ''), ('replay', '.csv'), ('convert', '.mcap'), ('plot', '.svg')):
+        assert main([command, str(copy), *(['--out', f'{copy}{suffix}'] if suffix else [])]) == 0
+        output = capsys.readouterr().out
+        clean_of(output)
+        assert '\\x1b[31m\\nstate' in output, command
 
 
-def test_a_message_about_a_file_prints_none_either(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_message_about_a_file_prints_none_either(tmp_path: Path, capsys: Capsys) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**: {ros__parameters: {"\\e[31mRED": 1}}')
     assert main(['params', '--params-file', str(rig)]) == 3
     copy = tmp_path / 'copy\x1b[31m'
-    shutil.copytree(CLEAN_BAG, copy)
+    shutil.copytree(CLEAN, copy)
     (copy / 'metadata.yaml').write_text('x: [')
     assert main(['info', str(copy)]) == 4
     output = capsys.readouterr().err

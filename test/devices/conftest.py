@@ -7,9 +7,10 @@ that passes only while somebody waits, so that a device is never late and waits 
 sources that measure how quick the device is, whatever else the machine does.
 """
 
+import itertools
 import queue
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -195,18 +196,16 @@ def unloaded() -> Callable[[Rig], RigFeed]:
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Callable[[LineDevice], Served]]:
-    made: list[Served] = []
+def served(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[[LineDevice], Served]:
+    numbers = itertools.count()
 
     def make(device: LineDevice) -> Served:
-        one = Served(tmp_path / f'port_{len(made)}')
+        one = Served(tmp_path / f'port_{next(numbers)}')
         one.plug(device)
-        made.append(one)
+        request.addfinalizer(one.unplug)
         return one
 
-    yield make
-    for one in made:
-        one.unplug()
+    return make
 
 
 @pytest.fixture
@@ -237,17 +236,13 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
 
 
 @pytest.fixture
-def run() -> Iterator[Callable[[Rig], Run]]:
-    started: list[Run] = []
-
+def run(request: pytest.FixtureRequest) -> Callable[[Rig], Run]:
     def make(rig: Rig) -> Run:
         one = Run(rig)
-        started.append(one)
+        request.addfinalizer(one.acquisition.stop)
         return one
 
-    yield make
-    for one in started:
-        one.acquisition.stop()
+    return make
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 import serial
@@ -109,8 +110,7 @@ def test_the_other_end_takes_nothing(connected: Connected, monkeypatch: pytest.M
 
 
 def test_a_host_that_is_cut_off_is_noticed_by_the_kernel(connected: Connected) -> None:
-    mine = socket.socket(fileno=os.dup(connected.port.fileno() or 0))
-    with mine:
+    with socket.socket(fileno=os.dup(connected.port.fileno() or 0)) as mine:
         assert mine.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
         assert mine.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == 4
         # Also if a question of ours waits for its confirmation.
@@ -138,29 +138,26 @@ def test_given_up_ends_a_read(connected: Connected) -> None:
 )
 @pytest.mark.parametrize('scheme', ['socket', 'rfc2217'])
 def test_why_there_is_no_connection(scheme: str, error: OSError, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def connect(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(socket, 'create_connection', connect)
+    monkeypatch.setattr(socket, 'create_connection', Mock(side_effect=error))
     with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {message}') as reported:
         open_port(f'{scheme}://rig:4000', BAUD)
     assert '\n' not in str(reported.value)
 
 
-def test_a_real_rejection(listener: socket.socket) -> None:
-    name = named(listener)
-    listener.close()
-    with pytest.raises(DeviceError, match='nothing listens on its port'):
+def not_opened(name: str, why: str) -> None:
+    with pytest.raises(DeviceError, match=why):
         open_port(name, BAUD)
 
 
-def test_no_thread_is_left_for_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    def reject(**_: object) -> threading.Thread:
-        raise RuntimeError("can't start new thread")
+def test_a_real_rejection(listener: socket.socket) -> None:
+    name = named(listener)
+    listener.close()
+    not_opened(name, 'nothing listens on its port')
 
-    monkeypatch.setattr(threading, 'Thread', reject)
-    with pytest.raises(DeviceError, match=r"socket://rig:4000: cannot be opened \(can't start new thread"):
-        open_port('socket://rig:4000', BAUD)
+
+def test_no_thread_is_left_for_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading, 'Thread', Mock(side_effect=RuntimeError("can't start new thread")))
+    not_opened('socket://rig:4000', r"socket://rig:4000: cannot be opened \(can't start new thread")
 
 
 class Datagrammed:
@@ -205,9 +202,8 @@ def of_device(start: bytes = b'device') -> Datagrams:
 
 @pytest.fixture
 def udp() -> Iterator[Datagrammed]:
-    made = Datagrammed(of_device())
-    yield made
-    made.close()
+    with contextlib.closing(Datagrammed(of_device())) as made:
+        yield made
 
 
 def shown(sender: socket.socket) -> str:
@@ -306,14 +302,9 @@ def test_given_up_ends_a_read_of_datagrams(udp: Datagrammed) -> None:
         udp.port.read(WAIT_S)
 
 
-def test_two_that_want_the_same_datagrams(udp: Datagrammed) -> None:
-    with pytest.raises(DeviceError, match=rf'{udp.name}: another program takes what comes there'):
-        open_port(udp.name, BAUD)
-
-
-def test_an_address_of_another_machine() -> None:
-    with pytest.raises(DeviceError, match=r'192\.0\.2\.1 is no address of this machine'):
-        open_port('udp://192.0.2.1:4000', BAUD)
+def test_datagrams_of_another_program_or_machine_are_not_taken(udp: Datagrammed) -> None:
+    not_opened(udp.name, rf'{udp.name}: another program takes what comes there')
+    not_opened('udp://192.0.2.1:4000', r'192\.0\.2\.1 is no address of this machine')
 
 
 class Terminal(serial.Serial):
@@ -379,9 +370,8 @@ class Remote:
 
 @pytest.fixture
 def remote() -> Iterator[Remote]:
-    made = Remote()
-    yield made
-    made.close()
+    with contextlib.closing(Remote()) as made:
+        yield made
 
 
 def await_input(port: OpenPort, size: int) -> None:
@@ -426,13 +416,10 @@ def test_more_than_can_be_read_ends_the_port(remote: Remote, monkeypatch: pytest
     port.close()
 
 
-def test_a_raw_port_is_not_taken_for_a_remote_serial_port(
-    listener: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_raw_port_is_no_remote_serial_port(listener: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp_port, 'OPEN_S', 0.2)
-    port = listener.getsockname()[1]
-    with pytest.raises(DeviceError, match=r'not as RFC 2217 says; is it a raw port \(socket://\)'):
-        open_port(f'rfc2217://127.0.0.1:{port}', BAUD)
+    name = named(listener).replace('socket://', 'rfc2217://')
+    not_opened(name, r'not as RFC 2217 says; is it a raw port \(socket://\)')
 
 
 @pytest.mark.parametrize(
@@ -496,9 +483,8 @@ def test_no_name_is_a_crash(rest: str) -> None:
 def test_a_device_that_must_be_asked_is_not_looked_for_over_udp() -> None:
     ten_volts = {'converter.bits': 16, 'converter.full_scale': 10.0}
     for source, port in (('dataq', 'udp://0.0.0.0:4000'), ('thorlabs', 'socket://a:1,udp://0.0.0.0:4000')):
-        with pytest.raises(
-            ConfigError, match=rf'source = {source}: port = .udp://0\.0\.0\.0:4000.: the device sends only'
-        ):
+        words = rf'source = {source}: port = .udp://0\.0\.0\.0:4000.: the device sends only'
+        with pytest.raises(ConfigError, match=words):
             make_source(load_rig(overrides={'source': source, 'port': port, **ten_volts}))
 
 

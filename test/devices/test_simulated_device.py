@@ -24,18 +24,15 @@ from psd_deflection.devices.replay import Pacer, Replay
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.serve import serve
 from psd_deflection.devices.source import Sample, SourceEndedError
-from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE, FloatArray
+from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.arrivals import Arrival, Ended
 from psd_deflection.run.session import Session
+from test.devices.conftest import no_load
 from test.heard import WAIT_S
 
 MS = 1_000_000
-
-
-def no_load(_: int, n: int) -> FloatArray:
-    return np.zeros((n, 3))
 
 
 def device(
@@ -64,11 +61,9 @@ def test_device_sends_samples_at_1khz_and_hello_at_1hz() -> None:
     assert all(f.t_device_us == 1000 * f.seq for f in taken)
     assert sum(isinstance(f, frames.StatusFrame) for f in got) == 3
     hellos = [f for f in got if isinstance(f, frames.HelloFrame)]
-    assert len(hellos) == 3
-    assert hellos[0].version == 1
-    assert hellos[0].info['channels'] == list(CHANNELS)
-    assert hellos[0].info['volts_per_count'] == 10.0 / 32768
-    assert hellos[0].info['sample_rate_hz'] == 1000.0
+    assert (len(hellos), hellos[0].version) == (3, 1)
+    info = {'channels': list(CHANNELS), 'volts_per_count': 10.0 / 32768, 'sample_rate_hz': 1000.0}
+    assert {name: hellos[0].info[name] for name in info} == info
     volts = np.array([f.counts for f in taken]) * 10.0 / 32768
     np.testing.assert_allclose(volts.std(axis=0), 2e-3, rtol=0.1)
     np.testing.assert_allclose(volts.mean(axis=0), [0, 0, 5, 0, 0, 5], atol=2e-4)
@@ -182,11 +177,8 @@ def test_a_converter_of_24_bits_sends_wide_samples_and_says_so() -> None:
     rig = load_rig(overrides={'converter.bits': 24})
     got = decoded(SimulatedFrames(RigFeed(rig, no_load)).take(500 * MS, room=1 << 30))
     hello = next(f for f in got if isinstance(f, frames.HelloFrame))
-    assert converter_parameters(hello.info) == {
-        'converter.sample_rate_hz': 1000.0,
-        'converter.bits': 24,
-        'converter.full_scale': 10.0,
-    }
+    reported = {'sample_rate_hz': 1000.0, 'bits': 24, 'full_scale': 10.0}
+    assert converter_parameters(hello.info) == {f'converter.{name}': value for name, value in reported.items()}
     volts = np.array([f.counts for f in got if isinstance(f, frames.SampleFrame)]) * rig.converter.volts_per_count
     assert volts.shape == (501, 6)
     assert np.abs(volts.mean(axis=0) - [0.0, 0.0, 5.0, 0.0, 0.0, 5.0]).max() < 5e-4
@@ -212,12 +204,10 @@ def test_a_hand_takes_the_place_of_the_cycle() -> None:
             hand.hold(bad)
 
 
-def test_a_rate_that_the_pair_cannot_do_ends_before_it_begins() -> None:
+def test_what_cannot_be_simulated_ends_before_it_begins() -> None:
+    """A rate that a pair cannot do, and a device without a twin, which needs a port."""
     with pytest.raises(DeviceError, match=r'converter\.sample_rate_hz = 1000 is out of reach'):
         Session(load_rig(overrides={'source': 'thorlabs'}), null_log)
-
-
-def test_a_device_without_a_twin_needs_a_port() -> None:
     with pytest.raises(ConfigError, match='name the recording'):
         Session(load_rig(overrides={'source': 'replay'}), null_log)
 
@@ -280,10 +270,15 @@ def test_it_takes_as_long_as_the_recording_and_stamps_with_now() -> None:
     assert samples[-1].t == pytest.approx(clock.t_ns, abs=1_000_000)
 
 
+def table(folder: Path, rate_hz: float) -> Path:
+    """A recording of a hundred samples."""
+    rows = ''.join(f'{i / rate_hz:.3f},0.1,0.2,5,0.3,0.4,5\n' for i in range(100))
+    (folder / 'run.csv').write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)
+    return folder / 'run.csv'
+
+
 def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
-    rows = ''.join(f'{i / 1000:.3f},0.1,0.2,5,0.3,0.4,5\n' for i in range(100))
-    path = tmp_path / 'run.csv'
-    path.write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)
+    path = table(tmp_path, 1000.0)
     logged: list[str] = []
     acquisition = Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), texts(logged.append))
     acquisition.open()
@@ -299,13 +294,9 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
 def test_error_names_a_file_that_is_not_a_recording(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match='no such recording'):
         make_source(load_rig(overrides={'source': 'replay', 'port': str(tmp_path / 'x')})).open(1.0)
-    with pytest.raises(ConfigError, match='name the recording'):
-        make_source(load_rig(overrides={'source': 'replay'}))
 
 
 def test_a_rig_of_another_rate_is_rejected(tmp_path: Path) -> None:
-    rows = ''.join(f'{i / 500:.3f},0,0,5,0,0,5\n' for i in range(100))
-    path = tmp_path / 'slow.csv'
-    path.write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)
+    path = table(tmp_path, 500.0)
     with pytest.raises(DeviceError, match='sample_rate_hz 500'):
         Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), texts(print)).open()

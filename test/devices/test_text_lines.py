@@ -99,8 +99,6 @@ def test_a_whole_line_that_comes_first_is_a_line() -> None:
 
 
 ALMOST = st.text('0123456789,.-+*#{} \r\n', max_size=60).map(str.encode)
-
-
 FIELDS = st.lists(st.sampled_from(['7', '-2', '.5', '1e3', 'x', '']), min_size=6, max_size=10)
 
 
@@ -130,11 +128,8 @@ def test_garbage_gives_no_sample_and_reading_continues(pieces: list[bytes]) -> N
 @pytest.mark.foreign
 def test_micros_wraps_and_restarts_with_the_device() -> None:
     extender = TimeExtender()
-    got = [
-        extender.extend(Line(s, t % 2**32, VALUES))
-        for s, t in [(100, 2**32 - 1000), (101, 2**32), (102, 2**32 + 1000), (0, 500), (1, 1500)]
-    ]
-    assert got == [2**32 - 1000, 2**32, 2**32 + 1000, 500, 1500]
+    lines = [(100, 2**32 - 1000), (101, 2**32), (102, 2**32 + 1000), (0, 500), (1, 1500)]
+    assert [extender.extend(Line(s, t % 2**32, VALUES)) for s, t in lines] == [t for _, t in lines]
 
 
 def test_micros_going_back_at_same_number_is_a_restart() -> None:
@@ -328,8 +323,7 @@ def test_three_psds(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
 )
 def test_a_line_of_three_psds(wired: Any, info: bytes, line: bytes, found: object) -> None:
     hello, event = sent(wired, info, line, **{'psd_3.center': [0.08, 0.0]})
-    assert hello.info['psds'] == 3
-    assert hello.info['channels'] == list(channel_names(3))
+    assert (hello.info['psds'], hello.info['channels']) == (3, list(channel_names(3)))
     assert (event.reason if isinstance(event, BadFrame) else event.readings) == found
 
 

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thorlabs aligners and DATAQ converters: messages written by hand, and simulated devices on lines of our own."""
 
+import contextlib
 import itertools
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,7 @@ X, Y = 8191 / 32767 * 10.0 * 2.0, -16384 / 32767 * 10.0 * 2.0
 
 
 def is_reply(reading: object) -> bool:
-    return (
-        isinstance(reading, apt.QuadrantReadings)
-        and reading.x == pytest.approx(X, rel=1e-4)
-        and reading.y == pytest.approx(Y, rel=1e-4)
-        and reading.total == pytest.approx(5.0, rel=1e-4)
-    )
+    return isinstance(reading, apt.QuadrantReadings) and tuple(reading) == pytest.approx((X, Y, 5.0), rel=1e-4)
 
 
 def test_questions_and_answers_byte_by_byte() -> None:
@@ -90,9 +86,7 @@ def test_without_light_no_place_is_made_up() -> None:
     assert apt.readings_of(3, -3, 328)[:2] == pytest.approx((300 / 32767 / 0.05005, -300 / 32767 / 0.05005), rel=1e-4)
 
 
-STREAM = (
-    b'\x01\x02\x03' + REPLY + b'\x81\x00\x02\x00\x01\x50' + REPLY + bytes.fromhex('7208 0200 81 50 0300') + REPLY * 2
-)
+STREAM = b'\1\2\3' + REPLY + b'\x81\0\2\0\1\x50' + REPLY + bytes.fromhex('7208 0200 81 50 0300') + REPLY * 2
 
 
 @given(st.lists(st.integers(0, len(STREAM)), max_size=30))
@@ -100,12 +94,9 @@ def test_messages_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     decoder = apt.AptDecoder()
     places = sorted({0, len(STREAM), *cuts})
     got = [m for a, b in itertools.pairwise(places) for m in decoder.feed(STREAM[a:b])]
-    assert [type(m) for m in got] == [
-        *(BadFrame, apt.QuadrantReadings, apt.QuadrantReadings, BadFrame, apt.QuadrantReadings, apt.QuadrantReadings),
-    ]
-    assert all(is_reply(m) for m in got if isinstance(m, apt.QuadrantReadings))
-    assert got[0] == BadFrame('no APT header', 3)
-    assert got[3] == BadFrame('length does not fit the message', 8)
+    bad = {0: BadFrame('no APT header', 3), 3: BadFrame('length does not fit the message', 8)}
+    assert {n: m for n, m in enumerate(got) if not is_reply(m)} == bad
+    assert len(got) == 6
 
 
 @given(st.lists(st.binary(max_size=100), max_size=10))
@@ -117,15 +108,17 @@ def test_garbage_raises_nothing_and_is_not_kept(pieces: list[bytes]) -> None:
     assert decoder.reset() == 0
 
 
-@pytest.mark.parametrize('port', ['', '/dev/ttyUSB0', 'a,b,c', 'a,', 'a,a'])
-def test_two_ports_are_needed(port: str) -> None:
-    with pytest.raises(ConfigError, match='two ports are needed'):
-        make_source(load_rig(overrides={'source': 'thorlabs', 'port': port}))
-
-
-def test_a_sign_is_a_sign() -> None:
-    with pytest.raises(ConfigError, match='must be 1 or -1'):
-        make_source(load_rig(overrides={'source': 'thorlabs', 'port': 'a,b', 'thorlabs.x_sign': 0.5}))
+@pytest.mark.parametrize(
+    ('source', 'port', 'other', 'why'),
+    [
+        *(('thorlabs', port, {}, 'two ports are needed') for port in ('', '/dev/ttyUSB0', 'a,b,c', 'a,', 'a,a')),
+        ('thorlabs', 'a,b', {'thorlabs.x_sign': 0.5}, 'must be 1 or -1'),
+        ('dataq', 'x', {'converter.full_scale': 5.0}, r'converter\.full_scale = 10'),
+    ],
+)
+def test_what_cannot_be_read_is_rejected(source: str, port: str, other: dict[str, float], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        make_source(load_rig(overrides={'source': source, 'port': port, **other}))
 
 
 SLOW: dict[str, object] = {
@@ -200,26 +193,28 @@ def test_a_port_where_nothing_answers_is_named(wired: Any, unloaded: Any) -> Non
         make_source(rig).open(0.3)
 
 
+@contextlib.contextmanager
+def started(rig: Rig) -> Iterator[Any]:
+    with contextlib.closing(make_source(rig)) as source:
+        source.open(2.0)
+        source.start()
+        yield source
+
+
 def test_an_answer_that_does_not_come_is_counted(pair: Any) -> None:
     _, _, rig = pair()
-    source = make_source(rig)
-    source.open(2.0)
-    source.start()
-    source._ports[1].write = lambda _: None  # type: ignore[attr-defined]
-    reading = source.read(0.1)
-    source.close()
+    with started(rig) as source:
+        source._ports[1].write = lambda _: None
+        reading = source.read(0.1)
     assert reading.events == [BadFrame('no answer in time', 0)]
 
 
 def test_port_lost_during_read_raises_port_closed(pair: Any) -> None:
     first, _, rig = pair()
-    source = make_source(rig)
-    source.open(2.0)
-    source.start()
-    first.unplug()
-    with pytest.raises(PortClosedError):
-        source.read(0.1)
-    source.close()
+    with started(rig) as source:
+        first.unplug()
+        with pytest.raises(PortClosedError):
+            source.read(0.1)
 
 
 @pytest.mark.parametrize(('size', 'fits'), [(255, True), (256, False)])
@@ -242,9 +237,7 @@ def test_ten_volts_are_half_of_16_bits() -> None:
 
 def test_commands_end_in_a_carriage_return() -> None:
     assert dataq.command('srate 60000') == b'srate 60000\r'
-    assert dataq.scan_list(range(6)) == [
-        'slist 0 0', 'slist 1 1', 'slist 2 2', 'slist 3 3', 'slist 4 4', 'slist 5 5', 'slist 6 10',
-    ]  # fmt: skip
+    assert dataq.scan_list(range(6)) == [*(f'slist {n} {n}' for n in range(6)), 'slist 6 10']
 
 
 @pytest.mark.parametrize(
@@ -264,11 +257,10 @@ def test_a_reply_is_found_behind_scans_and_between_zeros(received: bytes, asked:
     assert dataq.find_reply(received, asked) == reply
 
 
-@given(
-    st.lists(
-        st.binary(max_size=30) | st.sampled_from([b'info', b' 1', b'info 1', b' 2108', b'\r', b'\x00']), max_size=12
-    )
-)
+PIECES = st.binary(max_size=30) | st.sampled_from([b'info', b' 1', b'info 1', b' 2108', b'\r', b'\x00'])
+
+
+@given(st.lists(PIECES, max_size=12))
 def test_no_reply_is_made_up_and_the_one_that_follows_is_found(pieces: list[bytes]) -> None:
     received = b''.join(pieces)
     reply = dataq.find_reply(received, 'info 1')
@@ -283,6 +275,12 @@ def fed(stream: bytes, cuts: list[int]) -> list[Any]:
     return [item for a, b in itertools.pairwise(places) for item in decoder.feed(stream[a:b])]
 
 
+def parted(got: list[Any]) -> tuple[list[Any], list[int]]:
+    """The scans, and the sizes of what was none."""
+    scans = [item for item in got if not isinstance(item, BadFrame)]
+    return scans, [item.size for item in got if isinstance(item, BadFrame)]
+
+
 @given(st.lists(st.integers(0, 10_000), max_size=20))
 def test_scans_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
     assert fed(SCAN * 20, cuts) == [COUNTS] * 20
@@ -293,8 +291,8 @@ def test_lost_bytes_are_observed_and_the_step_is_found_again(lost: int, cuts: li
     stream = SCAN * 5 + SCAN[lost:] + SCAN * 10
     got = fed(stream, cuts)
     assert got == fed(stream, [])
-    assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * 15
-    assert sum(g.size for g in got if isinstance(g, BadFrame)) == 14 - lost
+    scans, sizes = parted(got)
+    assert (scans, sum(sizes)) == ([COUNTS] * 15, 14 - lost)
 
 
 @given(st.integers(1, 40), st.lists(st.integers(0, 10_000), max_size=20))
@@ -305,23 +303,19 @@ def test_lost_bytes_are_observed_and_the_step_is_found_again(lost: int, cuts: li
 def test_bytes_between_scans_cost_no_scan(more: int, cuts: list[int]) -> None:
     """Also if they are as many as a scan has, as where a marker is damaged: four scans in all tell the step."""
     for following in (4 if more % 14 else 3, 10):
-        got = fed(SCAN * 5 + b'\x11' * more + SCAN * following, cuts)
-        assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * (5 + following)
+        scans, sizes = parted(fed(SCAN * 5 + b'\x11' * more + SCAN * following, cuts))
         # By a scan's length at a time, and then what is left.
         full = (more - 1) // 14
-        assert [g.size for g in got if isinstance(g, BadFrame)] == [14] * full + [more - 14 * full]
+        assert (scans, sizes) == ([COUNTS] * (5 + following), [14] * full + [more - 14 * full])
 
 
 def test_two_readings_at_the_rail_are_no_marker() -> None:
     """The marker is the negative rail as well: three in a row in one place tell the step, two do not."""
     railed = bytes.fromhex('0100 0080') + SCAN[4:]
     # A byte is lost before the first of two scans whose y1 is at the rail.
-    stream = SCAN * 3 + SCAN[1:] + railed * 2 + SCAN * 6
-    got = fed(stream, [])
-    assert [g.size for g in got if isinstance(g, BadFrame)] == [13]
-    assert [g for g in got if not isinstance(g, BadFrame)] == [COUNTS] * 3 + [(1, -32768, *COUNTS[2:])] * 2 + [
-        COUNTS
-    ] * 6
+    scans, sizes = parted(fed(SCAN * 3 + SCAN[1:] + railed * 2 + SCAN * 6, []))
+    assert scans == [*[COUNTS] * 3, *[(1, -32768, *COUNTS[2:])] * 2, *[COUNTS] * 6]
+    assert sizes == [13]
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 10_000), max_size=8))
@@ -346,11 +340,6 @@ def test_the_rate_is_laid_out_from_the_clock(model: str, hz: float, per_channel:
     assert rate.hz == pytest.approx(hz, rel=1e-3)
 
 
-def test_a_rate_that_the_model_cannot_do_has_no_setting() -> None:
-    assert dataq.plan_rate(500.0, dataq.MODELS['1110'], False) is None
-    assert dataq.plan_rate(1e6, dataq.MODELS['2108'], False) is None
-
-
 def test_the_models_are_those_of_the_data_sheets() -> None:
     """Analog inputs, a counter, a decimating filter; the highest rate is 60 MHz over the least srate."""
     assert {name: (m.analog, m.counter, m.decimates, 60e6 / m.srate_min) for name, m in dataq.MODELS.items()} == {
@@ -369,6 +358,8 @@ def test_the_models_are_those_of_the_data_sheets() -> None:
         ('2108', 161_000.0, False),
         ('1110', 60e6 / 65_535, True),
         ('1110', 60e6 / 65_537, False),
+        ('1110', 500.0, False),
+        ('2108', 1e6, False),
         ('2108', 60e6 / 65_537, True),
         ('2108', 60e6 / (65_535 * 512), True),
         ('2108', 60e6 / (65_535 * 512.01), False),
@@ -419,10 +410,22 @@ def test_a_busy_host_measures_again(wired: Any, unloaded: Any, trials: int) -> N
     assert float(source.describe()['scan rate at start (1/s)']) == pytest.approx(1000.0, rel=0.1)
 
 
-def test_another_rate_than_was_set_is_rejected(wired: Any, unloaded: Any) -> None:
-    port = wired(SimulatedDataq(unloaded(load_rig()), PowerUp(skew_ppm=-3e5)))
-    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
-    with pytest.raises(DeviceError, match=r'does 7\d\d\.\d scans/s where 1000\.0 were set'):
+@pytest.mark.parametrize(
+    ('of_device', 'hz', 'message'),
+    [
+        ({'power_up': PowerUp(skew_ppm=-3e5)}, 1000.0, r'does 7\d\d\.\d scans/s where 1000\.0 were set'),
+        ({'model': '1100'}, 1000.0, '4 analog inputs and no counter'),
+        ({'model': '718B'}, 1000.0, "model '718B'; known are 1100"),
+        ({'model': '1110'}, 500.0, 'cannot do 500 scans/s'),
+    ],
+)
+def test_a_device_that_will_not_do_is_named(
+    wired: Any, unloaded: Any, of_device: dict[str, Any], hz: float, message: str
+) -> None:
+    rate = {'converter.sample_rate_hz': hz}
+    port = wired(SimulatedDataq(unloaded(load_rig(overrides=rate)), **of_device))
+    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link), **rate}))
+    with pytest.raises(DeviceError, match=message):
         source.open(2.0)
 
 
@@ -436,31 +439,6 @@ def test_a_silent_device_is_configured_again(wired: Any, run: Any, unloaded: Any
     running.heard('the device is back')
     running.forget()
     running.take(40)
-
-
-@pytest.mark.parametrize(
-    ('model', 'message'), [('1100', '4 analog inputs and no counter'), ('718B', "model '718B'; known are 1100")]
-)
-def test_a_model_that_will_not_do_is_named(wired: Any, unloaded: Any, model: str, message: str) -> None:
-    port = wired(SimulatedDataq(unloaded(load_rig()), model=model))
-    source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
-    with pytest.raises(DeviceError, match=message):
-        source.open(2.0)
-
-
-def test_a_rate_out_of_reach_is_named(wired: Any, unloaded: Any) -> None:
-    rig = load_rig(overrides={'converter.sample_rate_hz': 500.0})
-    port = wired(SimulatedDataq(unloaded(rig), model='1110'))
-    source = make_source(
-        load_rig(overrides={'source': 'dataq', 'port': str(port.link), 'converter.sample_rate_hz': 500.0})
-    )
-    with pytest.raises(DeviceError, match='cannot do 500 scans/s'):
-        source.open(2.0)
-
-
-def test_another_range_is_rejected() -> None:
-    with pytest.raises(ConfigError, match=r'converter\.full_scale = 10'):
-        make_source(load_rig(overrides={'source': 'dataq', 'port': 'x', 'converter.full_scale': 5.0}))
 
 
 def test_the_simulated_one_says_what_it_is_and_nothing_by_itself(unloaded: Any) -> None:

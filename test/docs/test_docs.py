@@ -13,6 +13,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,10 @@ from tools.program import PSD_DEFLECTION, ROOT
 from tools.run_commands import FENCE, PAGES
 
 ALL = list(run_commands.commands())
+
+
+def run(words: Sequence[str], cwd: Path = ROOT, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(words, cwd=cwd, capture_output=True, text=True, check=False, env=env)
 
 
 def test_there_are_commands_and_python_blocks(tmp_path: Path) -> None:
@@ -74,8 +79,7 @@ def test_make_has_few_targets_and_help_names_each() -> None:
 def test_ci_runs_what_it_is_reported_to_run() -> None:
     for _, file, text in run_commands.CI_RUNS:
         assert text in (ROOT / file).read_text(), (file, text)
-    targets = make_targets()
-    assert {c.line.split()[1] for c in ALL if c.line.startswith('make ')} <= targets
+    assert {c.line.split()[1] for c in ALL if c.line.startswith('make ')} <= make_targets()
 
 
 def anchors(page: Path) -> set[str]:
@@ -94,10 +98,14 @@ def linked(page: Path) -> set[Path]:
     return {(page.parent / target.partition('#')[0]).resolve() for target in links(page) if target[0] != '#'}
 
 
-def test_every_page_is_two_steps_from_the_readme() -> None:
+def near_readme() -> set[Path]:
+    """The files that are two steps from it."""
     first = linked(ROOT / 'README.md')
-    second = set().union(*(linked(page) for page in first if page.suffix == '.md'))
-    assert {str(page.relative_to(ROOT)) for page in PAGES if page not in first | second | {ROOT / 'README.md'}} == set()
+    return first.union(*(linked(page) for page in first if page.suffix == '.md'))
+
+
+def test_every_page_is_two_steps_from_the_readme() -> None:
+    assert {*PAGES} - near_readme() - {ROOT / 'README.md'} == set()
 
 
 QUESTIONS = {
@@ -141,13 +149,9 @@ QUESTIONS = {
 
 
 def test_newcomer_questions_are_answered_near_readme() -> None:
-    first = linked(ROOT / 'README.md')
-    near = first.union(*(linked(page) for page in first if page.suffix == '.md'))
-    docs = ROOT / 'docs'
-    answered = {
-        q for q, (name, words) in QUESTIONS.items() if docs / name in near and words in (docs / name).read_text()
-    }
-    assert set(QUESTIONS) - answered == set()
+    docs, near = ROOT / 'docs', near_readme()
+    asked = {q: (docs / name, words) for q, (name, words) in QUESTIONS.items()}
+    assert [q for q, (page, words) in asked.items() if page not in near or words not in page.read_text()] == []
 
 
 def named(tree: Any) -> list[str]:
@@ -159,9 +163,7 @@ def named(tree: Any) -> list[str]:
 
 def test_every_page_is_once_in_the_menu() -> None:
     menu = named(yaml.safe_load((ROOT / 'packaging/mkdocs.yml').read_text())['nav'])
-    assert sorted(menu) == sorted(
-        str(page.relative_to(ROOT / 'docs')) for page in PAGES if page.name != 'README.md' or page.parent != ROOT
-    )
+    assert sorted(menu) == sorted(str(page.relative_to(ROOT / 'docs')) for page in PAGES if page != ROOT / 'README.md')
 
 
 def test_the_pages_are_short() -> None:
@@ -224,14 +226,8 @@ def test_a_notebook_is_shipped_executed_and_runs_in_any_folder(notebook: Path, t
         if cell['cell_type'] == 'code':
             cell.update(outputs=[], execution_count=None)
     copy.write_text(json.dumps(cells))
-    done = subprocess.run(
-        [sys.executable, '-m', 'pytest', '-q', '--nbmake', '--overwrite', '-p', 'no:cacheprovider', copy.name],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, 'PYTHONPATH': str(ROOT), 'HOME': str(tmp_path)},
-    )
+    words = ('-m', 'pytest', '-q', '--nbmake', '--overwrite', '-p', 'no:cacheprovider', copy.name)
+    done = run((sys.executable, *words), tmp_path, {**os.environ, 'PYTHONPATH': str(ROOT), 'HOME': str(tmp_path)})
     assert done.returncode == 0, done.stdout
     assert outputs(copy) == outputs(notebook)
     assert sum(('image/png' in str(kinds)) for cell in outputs(notebook) for kinds in cell) == 1
@@ -278,7 +274,7 @@ def verified(text: str, folder: Path) -> tuple[int, str]:
         pytest.skip('the unit file is verified by systemd: apt install systemd')
     unit = folder / UNIT.name
     unit.write_text(text.replace('/opt/psd_deflection/bin/psd-deflection', sys.executable))
-    done = subprocess.run(['systemd-analyze', 'verify', unit], capture_output=True, text=True, check=False)
+    done = run(('systemd-analyze', 'verify', str(unit)))
     return done.returncode, '\n'.join(line for line in done.stderr.splitlines() if UNIT.name in line)
 
 
@@ -291,10 +287,8 @@ def test_the_unit_asks_for_what_the_daemon_uses() -> None:
     unit.optionxform = str  # type: ignore[assignment, method-assign]
     unit.read(UNIT)
     service = unit['Service']
-    assert service['Type'] == 'notify'
+    assert (service['Type'], service['LimitRTPRIO'], service['LimitMEMLOCK']) == ('notify', '50', 'infinity')
     assert int(service['WatchdogSec']) > 5
-    assert service['LimitRTPRIO'] == '50'
-    assert service['LimitMEMLOCK'] == 'infinity'
     program, command, *arguments = service['ExecStart'].split()
     assert program.endswith('/psd-deflection')
     assert command in COMMANDS
@@ -322,7 +316,7 @@ def test_github_takes_the_workflow(tmp_path: Path) -> None:
     workflow = tmp_path / 'recordings.yml'
     workflow.write_text(BLOCKS['yaml'])
     check = [sys.executable, '-m', 'check_jsonschema', '--builtin-schema', 'vendor.github-workflows']
-    done = subprocess.run([*check, workflow], capture_output=True, text=True, check=False)
+    done = run((*check, str(workflow)))
     assert done.returncode == 0, done.stdout
 
 
@@ -336,14 +330,8 @@ def test_the_lines_run(tmp_path: Path) -> None:
     assert len(lines) == 3
     programs = f'{Path(sys.executable).parent}:/usr/bin:/bin'
     for line in lines:
-        done = subprocess.run(
-            ['bash', '-e', '-c', line.replace('psd-deflection ', f'{shlex.join(PSD_DEFLECTION)} ')],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-            env={'PATH': programs, 'PYTHONPATH': str(ROOT)},
-        )
+        typed = line.replace('psd-deflection ', f'{shlex.join(PSD_DEFLECTION)} ')
+        done = run(('bash', '-e', '-c', typed), tmp_path, {'PATH': programs, 'PYTHONPATH': str(ROOT)})
         # Last bits may differ on a machine of another kind, as the page says.
         assert done.returncode == 0 or (done.returncode == 1 and '--compare' in line), done.stdout + done.stderr
     assert done.stdout.endswith('mdeg\n')
@@ -355,13 +343,6 @@ def test_a_changed_rig_file_fails_the_check(tmp_path: Path) -> None:
     (tmp_path / 'config').mkdir()
     changed = (ROOT / 'config' / 'thesis_rig.yaml').read_text().replace('[-0.100, 0.0]', '[-0.099, 0.0]')
     (tmp_path / 'config' / 'thesis_rig.yaml').write_text(changed)
-    done = subprocess.run(
-        [sys.executable, '-c', BLOCKS['python']],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={'PYTHONPATH': str(ROOT)},
-    )
+    done = run((sys.executable, '-c', BLOCKS['python']), tmp_path, {'PYTHONPATH': str(ROOT)})
     assert done.returncode == 1
     assert 'AssertionError: the estimates have changed' in done.stderr

@@ -24,6 +24,7 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.mcap_reader import McapReader
 from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.repair import recover
 from psd_deflection.recordings.replay.engine import rig_at_end, rig_at_start
 from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
@@ -43,6 +44,8 @@ from psd_deflection.rig.config import Rig, load_rig
 from .making import HELLO, T0, assert_same, block, run, write_mcap
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
+Capsys = pytest.CaptureFixture[str]
+Write = Callable[[Path, Sequence[SampleBlock]], Path]
 
 
 @pytest.fixture(scope='module')
@@ -82,8 +85,7 @@ def test_recorded_estimates_come_back(complete_bag: Path) -> None:
         '/link_tip/wls/deflection',
     }
     expected = [r for r in run(150) if isinstance(r, DeflectionEstimate) and r.primary]
-    for topic in ('/link_tip/deflection', '/link_tip/deflection_with_covariance'):
-        got = series[topic]
+    for got in (series['/link_tip/deflection'], series['/link_tip/deflection_with_covariance']):
         np.testing.assert_array_equal(got.t_ns, [e.t_ns for e in expected])
         np.testing.assert_array_equal(got.pose[:, :2], [(e.dx, e.dy) for e in expected])
         np.testing.assert_allclose(got.pose[:, 2], [e.theta for e in expected], rtol=1e-12)
@@ -114,10 +116,17 @@ def test_several_files_are_read_in_their_order(tmp_path: Path) -> None:
     for i in range(11):
         write_mcap(folder / f'run_{i}.mcap', records[4 * i : 4 * i + 4])
     assert_same(list(open_recording(folder).blocks()), records)
-    names = [f'run_{i}.mcap' for i in range(10, -1, -1)]
-    information = {'version': 9, 'storage_identifier': 'mcap', 'relative_file_paths': names[-3:]}
+    names = ['run_2.mcap', 'run_1.mcap', 'run_0.mcap']
+    information = {'version': 9, 'storage_identifier': 'mcap', 'relative_file_paths': names}
     (folder / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': information}))
     assert next(open_recording(folder).blocks()).index == 8
+
+
+def came_back(folder: Path, records: Sequence[SampleBlock], write: Write = write_mcap) -> Recording:
+    """The recording that ``write`` makes of these, once its blocks are seen to be the same."""
+    recording = open_recording(write(folder / 'a.mcap', records))
+    assert_same(list(recording.blocks()), records)
+    return recording
 
 
 def modulo(path: Path, records: Sequence[SampleBlock]) -> Path:
@@ -132,36 +141,26 @@ def modulo(path: Path, records: Sequence[SampleBlock]) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('write', [write_mcap, modulo])
-def test_numbers_go_on_past_32_bits_within_a_file(
-    tmp_path: Path, write: Callable[[Path, Sequence[SampleBlock]], Path]
-) -> None:
+def test_numbers_go_on_past_32_bits_within_a_file(tmp_path: Path, write: Write) -> None:
     start = 2**32 // 20 - 3
-    records = [block(start + i, first_index=start, lost=(5,) if i == 2 else ()) for i in range(70)]
-    assert_same(list(open_recording(write(tmp_path / 'a.mcap', records)).blocks()), records)
+    came_back(tmp_path, [block(start + i, first_index=start, lost=(5,) * (i == 2)) for i in range(70)], write)
 
 
 @pytest.mark.parametrize('epoch', [1, 2, 7])
 def test_blocks_of_a_run_past_its_wrap_are_cut_as_they_were(tmp_path: Path, epoch: int) -> None:
     start = epoch * 2**32 // 20 + 2
-    records = [block(start + i, first_index=start) for i in range(60)]
-    assert_same(list(open_recording(write_mcap(tmp_path / 'a.mcap', records)).blocks()), records)
+    came_back(tmp_path, [block(start + i, first_index=start) for i in range(60)])
 
 
 @pytest.mark.parametrize('write', [write_mcap, modulo])
-def test_a_long_gap_with_a_wrap_in_it_is_a_gap(
-    tmp_path: Path, write: Callable[[Path, Sequence[SampleBlock]], Path]
-) -> None:
+def test_a_long_gap_with_a_wrap_in_it_is_a_gap(tmp_path: Path, write: Write) -> None:
     start, gap = 2**32 // 20 - 100_000, 300_000
-    records = [block(start, first_index=start), block(start + gap, first_index=start)]
-    assert_same(list(open_recording(write(tmp_path / 'a.mcap', records)).blocks()), records)
+    came_back(tmp_path, [block(start, first_index=start), block(start + gap, first_index=start)], write)
 
 
 @pytest.mark.slow
 def test_a_jump_of_the_whole_number_needs_no_guess(tmp_path: Path) -> None:
-    records = [block(5), block(3 * 2**32, first_index=3 * 2**32 - 10)]
-    recording = open_recording(write_mcap(tmp_path / 'a.mcap', records))
-    assert_same(list(recording.blocks()), records)
-    assert not recording.warnings
+    assert not came_back(tmp_path, [block(5), block(3 * 2**32, first_index=3 * 2**32 - 10)]).warnings
 
 
 @pytest.mark.slow
@@ -249,10 +248,7 @@ def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
     t_ns[12:] += 10 * 10**9
     paused = SampleBlock(1, full.seq, t_ns, full.volts, full.flags)
     later = block(2, t0=T0 + 10 * 10**9)
-    assert_same(
-        list(open_recording(write_mcap(tmp_path / 'a.mcap', [block(0), paused, later])).blocks()),
-        [block(0), paused, later],
-    )
+    came_back(tmp_path, [block(0), paused, later])
 
 
 @pytest.mark.slow
@@ -267,18 +263,10 @@ def cloud(
     """PointCloud2 fields with any layout that has our eight names."""
     kinds = {'u4': 6, 'f4': 7, 'f8': 8, 'u2': 4}
     order = '>' if big else '<'
-    offsets, at = [], 4
-    for n in names:
-        offsets.append(at)
-        at += int(formats.get(n, 'f4')[1])
-    dtype = np.dtype(
-        {
-            'names': list(names),
-            'formats': [order + formats.get(n, 'f4') for n in names],
-            'offsets': offsets,
-            'itemsize': step,
-        }
-    )
+    own = [formats.get(n, 'f4') for n in names]
+    offsets = [4 + sum(int(kind[1]) for kind in own[:i]) for i in range(len(names))]
+    ordered = [order + kind for kind in own]
+    dtype = np.dtype({'names': list(names), 'formats': ordered, 'offsets': offsets, 'itemsize': step})
     points = np.zeros(len(b.seq), dtype)
     points['seq'] = b.seq
     points['dt'] = b.t_ns - b.t_ns[0]
@@ -289,8 +277,8 @@ def cloud(
         **message.fields,
         'header': {**message.fields['header'], 'frame_id': 'some_other_frame'},
         'fields': [
-            {'name': n, 'offset': o, 'datatype': kinds[formats.get(n, 'f4')], 'count': 1}
-            for n, o in zip(names, offsets, strict=True)
+            {'name': n, 'offset': o, 'datatype': kinds[kind], 'count': 1}
+            for n, o, kind in zip(names, offsets, own, strict=True)
         ],
         'is_bigendian': big,
         'point_step': step,
@@ -460,11 +448,10 @@ def passed_on(
         for connection, t_ns, raw in source.messages():
             if not keep(connection.topic, t_ns - source.start_time):
                 continue
-            if connection.topic not in made:
-                made[connection.topic] = target.add_connection(
-                    name(connection.topic), connection.msgtype, typestore=STORE
-                )
-            target.write(made[connection.topic], t_ns, raw)
+            topic = connection.topic
+            if topic not in made:
+                made[topic] = target.add_connection(name(topic), connection.msgtype, typestore=STORE)
+            target.write(made[topic], t_ns, raw)
     assert not any(name.startswith('psd_deflection') for f in out.glob('*.mcap') for name in McapReader(f).metadata)
     return out
 
@@ -479,9 +466,8 @@ def copied(out: Path, bags: Sequence[tuple[str, Path]], chunk_size: int = 1_000_
             for channel, log_time, message in open_recording(folder).messages():
                 topic = namespace + channel.topic
                 if topic not in numbers:
-                    numbers[topic] = writer.register_channel(
-                        topic, 'cdr', writer.register_schema(channel.type, 'ros2msg', b'')
-                    )
+                    schema = writer.register_schema(channel.type, 'ros2msg', b'')
+                    numbers[topic] = writer.register_channel(topic, 'cdr', schema)
                 writer.add_message(numbers[topic], log_time, message, log_time)
         writer.finish()
     return out
@@ -497,7 +483,7 @@ def rigs(bag: Path) -> tuple[Rig, Rig]:
 
 
 @pytest.mark.slow
-def test_rig_zero_and_hello_are_messages_too(zeroed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rig_zero_and_hello_are_messages_too(zeroed: Path, tmp_path: Path, capsys: Capsys) -> None:
     bag = passed_on(zeroed, tmp_path / 'converted')
     before, after = open_recording(zeroed), open_recording(bag)
     assert rigs(bag) == rigs(zeroed)
@@ -529,7 +515,7 @@ def test_another_rig_in_the_same_bag_is_reported(tmp_path: Path) -> None:
     assert any('another rig starts' in w for w in recording.warnings)
 
 
-def test_what_both_hold_is_compared(zeroed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_both_hold_is_compared(zeroed: Path, tmp_path: Path, capsys: Capsys) -> None:
     kept = ('/psd/samples', '/link_tip/deflection', RIG)
 
     def edges(topic: str, since: int) -> bool:
@@ -551,7 +537,7 @@ def test_what_both_hold_is_compared(zeroed: Path, tmp_path: Path, capsys: pytest
     assert not compared['identical']
 
 
-def test_a_gap_amid_our_own_recording_is_a_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gap_amid_our_own_recording_is_a_difference(tmp_path: Path, capsys: Capsys) -> None:
     def without(folder: Path, lost: range) -> Path:
         recording = open_recording(CLEAN)
         with BagWriter(folder, rig_values=dict(recording.parameters)) as bag:
@@ -569,9 +555,7 @@ def test_a_gap_amid_our_own_recording_is_a_difference(tmp_path: Path, capsys: py
     assert '2 only in the replay' in capsys.readouterr().out
 
 
-def test_a_namespaced_recording_is_read_as_it_is(
-    zeroed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_namespaced_recording_is_read_as_it_is(zeroed: Path, tmp_path: Path, capsys: Capsys) -> None:
     bag = passed_on(zeroed, tmp_path / 'arm', in_arm)
     assert open_recording(bag).topics() == open_recording(zeroed).topics()
     assert rigs(bag) == rigs(zeroed)
@@ -586,7 +570,7 @@ def test_a_namespaced_recording_is_read_as_it_is(
     assert sum(1 for _ in recording.blocks()) > 50
 
 
-def test_of_several_rigs_one_is_chosen(zeroed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_of_several_rigs_one_is_chosen(zeroed: Path, tmp_path: Path, capsys: Capsys) -> None:
     two = copied(tmp_path / 'two.mcap', [('/left', CLEAN), ('/right', zeroed)])
     with pytest.raises(RecordingError, match='2 rigs; give the namespace of one: /left, /right'):
         open_recording(two)
@@ -623,18 +607,16 @@ def test_remapped_samples_are_found_and_no_foreign_cloud(zeroed: Path, tmp_path:
 RECORDS = [block(i) for i in range(40)]
 
 
-def bag(folder: Path, *, storage: str | None = 'mcap', listed: tuple[str, ...] = ('run_0.mcap',)) -> Path:
-    folder.mkdir()
+def bag(folder: Path, storage: str | None = 'mcap') -> Path:
+    information(folder, version=5, storage_identifier=storage, relative_file_paths=['run_0.mcap'])
     write_mcap(folder / 'run_0.mcap', RECORDS)
-    information = {'version': 5, 'storage_identifier': storage, 'relative_file_paths': list(listed)}
-    (folder / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': information}))
     return folder
 
 
 @pytest.mark.foreign
 @pytest.mark.parametrize('storage', ['mcap', '', None])
 def test_a_bag_after_a_reindex_is_read(tmp_path: Path, storage: str | None) -> None:
-    recording = open_recording(bag(tmp_path / 'run', storage=storage))
+    recording = open_recording(bag(tmp_path / 'run', storage))
     assert_same(list(recording.blocks()), RECORDS)
     assert recording.warnings == []
 
@@ -653,9 +635,7 @@ def test_a_file_that_metadata_do_not_list_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.foreign
 @pytest.mark.parametrize('leap_s', [-3600.0, 12.0, 1.7e9])
-def test_a_leap_of_log_times_is_reported_once(
-    tmp_path: Path, leap_s: float, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_leap_of_log_times_is_reported_once(tmp_path: Path, leap_s: float, capsys: Capsys) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         for record in RECORDS:
             leapt = int(leap_s * 1e9) if record.index >= 20 else 0

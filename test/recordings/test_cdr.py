@@ -19,6 +19,7 @@ from psd_deflection.recordings import cdr
 pytestmark = pytest.mark.slow
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+CLOUD = 'sensor_msgs/msg/PointCloud2'
 
 FULL = {'int32': (-(2**31), 2**31 - 1), 'uint32': (0, 2**32 - 1), 'uint8': (0, 255), 'byte': (0, 255)}
 
@@ -76,9 +77,8 @@ def test_big_endian_numbers_are_read() -> None:
 def test_the_encoder_takes_every_kind_of_field() -> None:
     kinds = ['bool', 'byte', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64', 'uint64', 'float32']
     text = ''.join(f'{kind} {kind}_\n' for kind in kinds)
-    made_up = MessageType(
-        'test_msgs/msg/MadeUp', '', f'{text}string word\nint16[3] three\nuint8[2] two\nstring[] words\n'
-    )
+    text += 'string word\nint16[3] three\nuint8[2] two\nstring[] words\n'
+    made_up = MessageType('test_msgs/msg/MadeUp', '', text)
     values_of: dict[str, Any] = {f'{kind}_': i % 2 for i, kind in enumerate(kinds)}
     values_of |= {'word': 'µ', 'three': [1, -2, 3], 'two': b'ab', 'words': ['', 'long']}
     store = get_typestore(Stores.EMPTY)
@@ -87,9 +87,7 @@ def test_the_encoder_takes_every_kind_of_field() -> None:
     decoded = store.deserialize_cdr(encoded, made_up.name)
     for name, value in values_of.items():
         found = getattr(decoded, name)
-        assert (
-            bytes(found) if isinstance(value, bytes) else list(found) if isinstance(value, list) else found
-        ) == value
+        assert (type(value)(found) if isinstance(value, bytes | list) else found) == value
     assert bytes(store.serialize_cdr(decoded, made_up.name)) == encoded
     with pytest.raises(ValueError, match='2 values in an array of 3'):
         cdr.encoder_of(made_up)({**values_of, 'three': [1, 2]})
@@ -101,26 +99,13 @@ def test_a_type_that_is_not_ours_is_rejected() -> None:
 
 
 def test_constant_array_encodes_alike_at_any_offset() -> None:
-    fields = [
-        {'name': 'seq', 'offset': 0, 'datatype': 6, 'count': 1},
-        {'name': 'x', 'offset': 4, 'datatype': 7, 'count': 1},
-    ]
-    others = [*fields, {'name': 'y', 'offset': 8, 'datatype': 7, 'count': 1}]
-    rest = {
-        'height': 1,
-        'width': 0,
-        'is_bigendian': False,
-        'point_step': 8,
-        'row_step': 0,
-        'data': b'',
-        'is_dense': True,
-    }
-    kept = [Constant(fields), Constant(others), Constant([])]
+    names = (('seq', 6), ('x', 7), ('y', 7))
+    others = [{'name': name, 'offset': 4 * i, 'datatype': kind, 'count': 1} for i, (name, kind) in enumerate(names)]
+    size = {'height': 1, 'width': 0, 'point_step': 8, 'row_step': 0, 'data': b''}
+    kept = [Constant(others[:2]), Constant(others), Constant([])]
     for frame in ('', 'a', 'ab', 'abc', 'abcd', 'abcde', 'tip', 'link_tip') * 2:
         for constant in (*kept, kept[0], *kept):
             header = {'stamp': {'sec': 1, 'nanosec': 2}, 'frame_id': frame}
-            message = {'header': header, 'fields': constant, **rest}
+            message = {'header': header, 'fields': constant, 'is_bigendian': False, 'is_dense': True, **size}
             plain = {**message, 'fields': list(constant)}
-            assert cdr.encode('sensor_msgs/msg/PointCloud2', message) == cdr.encode(
-                'sensor_msgs/msg/PointCloud2', plain
-            )
+            assert cdr.encode(CLOUD, message) == cdr.encode(CLOUD, plain)

@@ -4,6 +4,7 @@
 
 import math
 import os
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
 from psd_deflection.records import (
     AppliedLoad,
-    DeflectionEstimate,
     Record,
     ReferencePose,
     SampleBlock,
@@ -36,6 +36,14 @@ ROW = '1.5,-2.25,5,0.5,0,5'
 def write(path: Path, *lines: str) -> Path:
     path.write_text('\n'.join(lines) + '\n')
     return path
+
+
+def put_all(sink: CsvSampleSink | CsvEstimateSink, records: Sequence[Record]) -> CsvSampleSink | CsvEstimateSink:
+    """The sink, closed behind them."""
+    for record in records:
+        sink.put(record)
+    sink.close()
+    return sink
 
 
 def rows(times: list[str]) -> list[str]:
@@ -108,9 +116,7 @@ def test_volts_come_through_bit_for_bit(tmp_path: Path, volts: list[float]) -> N
     path.unlink(missing_ok=True)
     v = np.array([volts, volts], np.float32)
     given_block = SampleBlock(0, np.arange(2), T0 + np.arange(2) * STEP, v, np.zeros(2, np.uint8))
-    sink = CsvSampleSink(path)
-    sink.put(given_block)
-    sink.close()
+    put_all(CsvSampleSink(path), [given_block])
     (back,) = open_recording(path).blocks()
     assert back.volts.tobytes() == v.tobytes()
     np.testing.assert_array_equal(back.t_ns, given_block.t_ns)
@@ -122,10 +128,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
     references = [ReferencePose(T0 + 7 * STEP, 1e-3, 2e-3, 0.1), ReferencePose(T0 + 30 * STEP, 1.5e-3, 2e-3, 0.2)]
     temperatures = [TemperatureReading(T0 + 10 * STEP, 21.5)]
     sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad, ReferencePose, TemperatureReading])
-    records: list[Record] = [*loads, *references, *temperatures, TipLoad(T0, 9.0, 9.0, 9.0), *blocks]
-    for record in records:
-        sink.put(record)
-    sink.close()
+    put_all(sink, [*loads, *references, *temperatures, TipLoad(T0, 9.0, 9.0, 9.0), *blocks])
     recording = open_recording(tmp_path / 'a.csv')
     np.testing.assert_array_equal(recording.samples['seq'], np.concatenate([b.seq for b in blocks]))
     assert recording.loads() == loads
@@ -136,9 +139,7 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
 
 def test_records_between_two_samples_go_to_the_later_row(tmp_path: Path) -> None:
     sink = CsvSampleSink(tmp_path / 'a.csv', [AppliedLoad])
-    sink.put(AppliedLoad(T0 + 3 * STEP + 1, 1.0, 0.0, 0.0))
-    sink.put(block(0))
-    sink.close()
+    put_all(sink, [AppliedLoad(T0 + 3 * STEP + 1, 1.0, 0.0, 0.0), block(0)])
     assert open_recording(tmp_path / 'a.csv').loads() == [AppliedLoad(T0 + 4 * STEP, 1.0, 0.0, 0.0)]
 
 
@@ -233,25 +234,14 @@ def test_no_text_ends_in_a_traceback(tmp_path: Path, junk: str, where: int) -> N
     assert '\n' not in line.replace(repr(junk)[1:-1], '')
 
 
-def other(e: DeflectionEstimate, solver: str, dx: float) -> DeflectionEstimate:
-    return e._replace(solver=solver, dx=dx, primary=False)
-
-
 def test_estimates_have_one_row_a_block(tmp_path: Path) -> None:
-    sink = CsvEstimateSink(tmp_path / 'e.csv', ['exact', 'wls'])
-    sink.put(block(0))
-    sink.put(estimate(0))
-    sink.put(TipLoad(estimate(0).t_ns, 1.5, -2.5, 0.125))
-    sink.put(other(estimate(0), 'wls', 0.25))
-    sink.put(TipLoad(estimate(2).t_ns, 9.0, 9.0, 9.0))
-    sink.put(estimate(3)._replace(chi_square=1.25))
-    sink.put(other(estimate(4), 'wls', 0.5))
-    sink.close()
-    sink.close()
+    of_wls = [estimate(i, 'wls', primary=False)._replace(dx=dx) for i, dx in ((0, 0.25), (4, 0.5))]
+    load, later = TipLoad(estimate(0).t_ns, 1.5, -2.5, 0.125), TipLoad(estimate(2).t_ns, 9.0, 9.0, 9.0)
+    records = (block(0), estimate(0), load, of_wls[0], later, estimate(3)._replace(chi_square=1.25), of_wls[1])
+    put_all(CsvEstimateSink(tmp_path / 'e.csv', ['exact', 'wls']), records).close()
     header, first, second, third = (tmp_path / 'e.csv').read_text().splitlines()
-    assert header == (
-        't,dx,dy,theta,sd_dx,sd_dy,sd_theta,exact_dx,exact_dy,exact_theta,wls_dx,wls_dy,wls_theta,chi_square,fx,fy,tz'
-    )
+    by_solver = 'exact_dx,exact_dy,exact_theta,wls_dx,wls_dy,wls_theta'
+    assert header == f't,dx,dy,theta,sd_dx,sd_dy,sd_theta,{by_solver},chi_square,fx,fy,tz'
     e = estimate(0)
     cells = first.split(',')
     assert cells[0] == f'{e.t_ns // 10**9}.{e.t_ns % 10**9:09d}'
@@ -272,10 +262,8 @@ def test_files_are_not_overwritten_and_errors_are_one_line(tmp_path: Path) -> No
     assert (tmp_path / 'a.csv').read_text() == 'keep me\n'
     with pytest.raises(RecordingError, match='cannot be made'):
         CsvEstimateSink(tmp_path / 'none' / 'a.csv', ['exact'])
-    sink = CsvSampleSink(tmp_path / 'b.csv')
-    sink.close()
     with pytest.raises(RecordingError, match='is closed'):
-        sink.put(block(0))
+        put_all(CsvSampleSink(tmp_path / 'b.csv'), []).put(block(0))
 
 
 def test_a_text_in_a_column_that_is_not_read_is_no_matter(tmp_path: Path) -> None:

@@ -49,9 +49,8 @@ def table(
     return before.replace('\n', end) + end.join([header.replace(',', separator), *rows, ''])
 
 
-PREAMBLE = ''.join(
-    f'{word}\t"{i}"\n' for i, word in enumerate(('ベンダ', 'モデル', '測定間隔', 'トリガ点', '開始時刻'))
-)
+WORDS = ('ベンダ', 'モデル', '測定間隔', 'トリガ点', '開始時刻')
+PREAMBLE = ''.join(f'{word}\t"{i}"\n' for i, word in enumerate(WORDS))
 EUROPE = 'Gerät;Müller & Söhne Prüfstand 3\nPrüfer;Jörg\n\n'
 LVM = 'LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\n***End_of_Header***\t\n'
 UNITS = '\n' + '\t'.join(['s', *['V'] * 6])

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -36,10 +37,9 @@ from psd_deflection.recordings.repair import recover
 from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import ParameterChange, SampleBlock
 from psd_deflection.rig.config import load_rig
+from tools.program import PSD_DEFLECTION
 
-from .making import STEP, assert_same, block, run, write_mcap
-
-HELLO = {'serial': 'A1', 'sample_rate_hz': 1000}
+from .making import HELLO, STEP, assert_same, block, run, write_mcap
 
 
 def record(folder: Path, **kwargs: float) -> Path:
@@ -129,12 +129,10 @@ def test_a_file_that_was_only_begun_is_set_aside(tmp_path: Path) -> None:
 
 
 def test_a_lone_file_is_repaired(tmp_path: Path) -> None:
-    with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
-        for r in run(100):
-            out.put(r)
-    (tmp_path / 'a.mcap').write_bytes((tmp_path / 'a.mcap').read_bytes()[:-1000])
-    assert recover(tmp_path / 'a.mcap').files[0].repaired
-    assert open_recording(tmp_path / 'a.mcap').complete
+    path = write_mcap(tmp_path / 'a.mcap', list(run(100)))
+    path.write_bytes(path.read_bytes()[:-1000])
+    assert recover(path).files[0].repaired
+    assert open_recording(path).complete
 
 
 def test_recover_rejects_a_running_recording(tmp_path: Path) -> None:
@@ -142,9 +140,7 @@ def test_recover_rejects_a_running_recording(tmp_path: Path) -> None:
     bag.put(block(0))
     bag.flush()
     # The lock of one process does not keep itself out: ask from another.
-    answer = subprocess.run(
-        [sys.executable, '-m', 'psd_deflection', 'recover', str(tmp_path / 'run')], capture_output=True, text=True
-    )
+    answer = subprocess.run([*PSD_DEFLECTION, 'recover', str(tmp_path / 'run')], capture_output=True, text=True)
     assert answer.returncode == 4
     assert 'is being recorded at this moment' in answer.stderr
     bag.close()
@@ -174,21 +170,17 @@ def test_an_unreadable_recording_gives_one_line(tmp_path: Path, content: bytes |
 
 
 def test_rotation_by_size_and_what_each_file_holds(tmp_path: Path) -> None:
-    rig = load_rig()
+    rig, records = load_rig(), list(run(400))
     change = ParameterChange(1, 5, (('sum_min', 1.0),))
     with BagWriter(tmp_path / 'run', rig_values=rig.values, device_hello=HELLO, max_bytes=100_000) as bag:
-        for i, r in enumerate(run(400)):
-            if i == 20:
-                bag.put(change)
+        for r in (*records[:20], change, *records[20:]):
             bag.put(r)
     files = sorted((tmp_path / 'run').glob('*.mcap'))
     assert len(files) >= 3
     assert all(f.stat().st_size >= 100_000 for f in files[:-1])
     for file in files:
         lone = open_recording(file)
-        assert lone.parameters == dict(rig.values)
-        assert lone.hello == HELLO
-        assert lone.changes == [change]
+        assert (lone.parameters, lone.hello, lone.changes) == (dict(rig.values), HELLO, [change])
     together = open_recording(tmp_path / 'run')
     assert together.changes == [change]
     assert [b.index for b in together.blocks()] == list(range(400))
@@ -239,8 +231,7 @@ def test_recover_rewrites_a_metadata_yaml_that_does_not_match(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = record(tmp_path / 'run')
-    before = theirs(folder)
-    metadata = folder / 'metadata.yaml'
+    before, metadata = theirs(folder), folder / 'metadata.yaml'
     metadata.write_text(text)
     assert main(['info', str(folder)]) == 4
     assert '`psd-deflection recover` makes' in capsys.readouterr().err
@@ -260,10 +251,7 @@ def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypat
     folder = record(tmp_path / 'run')
     cut(folder, 'run_0.mcap', 20_000)
     before = (folder / 'run_0.mcap').read_bytes()
-
-    def full(self: object) -> None:
-        raise OSError(28, 'No space left on device')
-
+    full = Mock(side_effect=OSError(28, 'No space left on device'))
     monkeypatch.setattr('psd_deflection.recordings.repair._Copy.finish', full)
     with pytest.raises(RecordingError, match='No space left on device'):
         recover(folder)
@@ -341,8 +329,7 @@ def top_level(content: bytes) -> list[tuple[int, int, int]]:
 
 
 def test_a_damaged_chunk_costs_itself_only(tmp_path: Path, complete: bytes) -> None:
-    chunks = [(at, length) for op, at, length in top_level(complete) if op == 6]
-    at, length = chunks[1]
+    at, length = [(at, length) for op, at, length in top_level(complete) if op == 6][1]
     spoiled = bytearray(complete)
     spoiled[at + length // 2] ^= 0xFF
     (tmp_path / 'a.mcap').write_bytes(spoiled)
@@ -368,8 +355,7 @@ def test_a_chunk_that_declares_too_much_is_not_unpacked(tmp_path: Path, complete
 
 def test_an_index_that_declares_too_much_ends_the_file(tmp_path: Path, complete: bytes) -> None:
     at = next(at for op, at, length in top_level(complete) if op == 7)
-    spoiled = complete[: at - 1] + b'\x80' + complete[at:]
-    (tmp_path / 'a.mcap').write_bytes(spoiled)
+    (tmp_path / 'a.mcap').write_bytes(complete[: at - 1] + b'\x80' + complete[at:])
     recording = BagRecording(tmp_path / 'a.mcap')
     assert [b.index for b in recording.blocks()] == list(range(25))
     assert f'ends at byte {at - 9} before its end' in recording.warnings[0]
@@ -513,20 +499,18 @@ def test_a_small_file_causes_little_work(crafted: Path, monkeypatch: pytest.Monk
 
 def test_file_unpacking_to_gigabytes_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
-    path.write_bytes(MAGIC + chunk(record_of(0x90, bytes(60_000_000))) * 100)
+    size = path.write_bytes(MAGIC + chunk(record_of(0x90, bytes(60_000_000))) * 100)
     recording = BagRecording(path)
     assert recording.topics() == {}
-    size = path.stat().st_size
     (line,) = (w for w in recording.warnings if 'unpacks to' in w)
-    bound = 64 * 2**20 + 100 * size
-    assert f'{path}: unpacks to more than {bound} bytes, as many as a file of {size} bytes may' in line
+    wanted = f'{path}: unpacks to more than {64 * 2**20 + 100 * size} bytes, as many as a file of {size} bytes may'
+    assert wanted in line
     assert not any('damaged' in w for w in recording.warnings)
 
 
 def test_channels_are_left_out_beyond_what_a_file_can_need(tmp_path: Path) -> None:
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(MAGIC + chunk(many(65_536)))
-    recording = BagRecording(path)
+    (tmp_path / 'a.mcap').write_bytes(MAGIC + chunk(many(65_536)))
+    recording = BagRecording(tmp_path / 'a.mcap')
     recording.topics()
     assert any('more records than a file of' in w for w in recording.warnings)
 
@@ -564,28 +548,16 @@ def test_a_record_of_gigabytes_is_not_read(tmp_path: Path, opcode: int) -> None:
 
 
 def test_cloud_of_too_many_fields_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    (ours,) = to_messages(block(0))
     field = {'name': 'x', 'offset': 0, 'datatype': 7, 'count': 1}
-    message = cdr.encode(
-        'sensor_msgs/msg/PointCloud2',
-        {
-            'header': {'stamp': {'sec': 1, 'nanosec': 0}, 'frame_id': 'link_tip'},
-            'height': 1,
-            'width': 0,
-            'fields': [field] * (MAX_FIELDS + 1),
-            'is_bigendian': False,
-            'point_step': 4,
-            'row_step': 0,
-            'data': b'',
-            'is_dense': True,
-        },
-    )
+    many_fields = {'width': 0, 'fields': [field] * (MAX_FIELDS + 1), 'point_step': 4, 'row_step': 0, 'data': b''}
+    message = cdr.encode(ours.type, {**ours.fields, **many_fields})
     monkeypatch.setattr(cdr, 'decode', lambda *_: pytest.fail('decoded'))
     with pytest.raises(ValueError, match='more than 64 fields'):
         CloudDecoder().decode(message)
 
 
 def test_a_long_recording_of_tiny_records_is_read_whole(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / 'a.mcap', list(run(400)))
-    recording = BagRecording(path)
+    recording = BagRecording(write_mcap(tmp_path / 'a.mcap', list(run(400))))
     assert recording.topics()[SAMPLES] == 400
     assert recording.complete

@@ -2,19 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real rclpy and real DDS: a domain of its own for each worker, and the daemon as a process."""
 
+import contextlib
 import math
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from test.run.conftest import ScriptedDevice
-from tools.program import PSD_DEFLECTION, WAIT_S, Program, ros_domain
+from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program, ros_domain
 
 pytest.importorskip('rclpy', reason='the ROS tests need rclpy: pip install .[ros]')
 
@@ -23,11 +24,14 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
 WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
 
 BLOCK_NS = 20_000_000
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 ASK_AGAIN_S = 20.0
 """An answer that has not come by then is lost."""
@@ -59,19 +63,29 @@ sys.exit(main())
 
 
 @pytest.fixture
-def start(domain: int) -> Iterator[Callable[..., Program]]:
-    """Start a daemon; it ends with the test."""
+def launch(domain: int) -> Iterator[Callable[..., Program]]:
+    """Start a command, ours unless it is another ``program``; it ends with the test."""
     started: list[Program] = []
 
-    def begin(*arguments: str, script: str = '') -> Program:
-        command = (sys.executable, '-c', script) if script else PSD_DEFLECTION
-        started.append(Program([*command, 'estimator', *arguments], env={'PYTHONWARNINGS': WARNINGS}))
+    def begin(*words: str, program: Sequence[str] = PSD_DEFLECTION, cwd: Path = ROOT) -> Program:
+        started.append(Program([*program, *words], cwd, env={'PYTHONWARNINGS': WARNINGS}))
         return started[-1]
 
     yield begin
-    for daemon in started:
-        daemon.end(signal.SIGTERM)
-        print(*daemon.lines[-50:], sep='\n')
+    for one in started:
+        one.end(signal.SIGTERM)
+        print(*one.lines[-50:], sep='\n')
+
+
+@pytest.fixture
+def start(launch: Callable[..., Program]) -> Callable[..., Program]:
+    """Start a daemon; it ends with the test."""
+
+    def begin(*arguments: str, script: str = '') -> Program:
+        program = (sys.executable, '-c', script) if script else PSD_DEFLECTION
+        return launch('estimator', *arguments, program=program)
+
+    return begin
 
 
 def stamp(message: Any) -> int:
@@ -169,9 +183,8 @@ class Peer:
 
 @pytest.fixture
 def peer(domain: int) -> Iterator[Peer]:
-    one = Peer()
-    yield one
-    one.close()
+    with contextlib.closing(Peer()) as one:
+        yield one
 
 
 @pytest.fixture(scope='session')

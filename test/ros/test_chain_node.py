@@ -3,7 +3,7 @@
 """Two simulated rigs in one node: the end effector and each link over real DDS."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros.chain import chain_transforms
 from psd_deflection.run.chain import Composed
-from test.ros.conftest import BLOCK_NS, WARNINGS, stamp
-from tools.program import PSD_DEFLECTION, ROOT, Program
+from test.ros.conftest import BLOCK_NS, stamp
+from tools.program import ROOT, Program
 
 pytestmark = pytest.mark.ros
 
@@ -28,13 +28,9 @@ EXAMPLE = ROOT / 'config' / 'two_links.yaml'
 
 
 @pytest.fixture
-def chain(domain: int, tmp_path: Path) -> Iterator[Program]:
+def chain(launch: Callable[..., Program], tmp_path: Path) -> Program:
     """The node on the example, which records below ``tmp_path`` when it is asked to."""
-    command = [*PSD_DEFLECTION, 'chain', '--ros-args', '-p', f'chain:={EXAMPLE}']
-    one = Program(command, env={'PYTHONWARNINGS': WARNINGS}, cwd=tmp_path)
-    yield one
-    one.end()
-    print(*one.lines[-50:], sep='\n')
+    return launch('chain', '--ros-args', '-p', f'chain:={EXAMPLE}', cwd=tmp_path)
 
 
 def test_end_effector_links_joints_zero_and_recording(chain: Program, peer: Any, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,21 +20,20 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import SetBool
 
 from bench.campaign.hold import WITHIN
 from bench.campaign.plant import BREAKS, DEFLECTIONS, JOINTS, URDF, Plant, faithful
-from test.ros.conftest import WARNINGS
+from test.ros.conftest import LATCHED
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
 
 STALE = '0.8'
 """s. On a busy machine this process is late too; test/arms/compensation has the default of 0.08 s."""
-ARGUMENTS = ('compensator', '--urdf', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive')
+ARGUMENTS = ('compensator', '--urdf', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive', '--stale', STALE)
 
 HANGS = """
 import sys
@@ -52,13 +51,12 @@ sys.exit(main())
 """Our program, whose main thread waits for input without end when the offsets are to be released."""
 
 
+Launch = Callable[..., Program]
+
+
 @pytest.fixture
-def compensator(domain: int) -> Iterator[Program]:
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE]
-    one = Program(command, env={'PYTHONWARNINGS': WARNINGS})
-    yield one
-    one.end()
-    print(*one.lines[-50:], sep='\n')
+def compensator(launch: Launch) -> Program:
+    return launch(*ARGUMENTS)
 
 
 def following(peer: Any, share: float = 0.05) -> Plant:
@@ -156,7 +154,7 @@ def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Prog
 @pytest.mark.slow
 def test_main_thread_that_hangs_lets_offsets_hold(domain: int, peer: Any) -> None:
     reading, writing = os.pipe()
-    process = subprocess.Popen([sys.executable, '-c', HANGS, *ARGUMENTS, '--stale', STALE], cwd=ROOT, stdin=reading)
+    process = subprocess.Popen([sys.executable, '-c', HANGS, *ARGUMENTS], cwd=ROOT, stdin=reading)
     os.close(reading)
     try:
         plant = following(peer, share=0.5)
@@ -214,9 +212,8 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
 def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program, peer: Any) -> None:
     plant = following(peer)
     states = peer.collect(DiagnosticArray, '/diagnostics')
-    senders = {
-        topic: peer.node.create_publisher(type(message), topic, 5) for message, topic, _ in strange_messages().values()
-    }
+    kinds = {topic: type(message) for message, topic, _ in strange_messages().values()}
+    senders = {topic: peer.node.create_publisher(kind, topic, 5) for topic, kind in kinds.items()}
     peer.until(lambda: all(s.get_subscription_count() for s in senders.values()), 'that it listens')
 
     def counted(topic: str) -> int:
@@ -236,10 +233,9 @@ def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program,
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> None:
+def test_a_robot_that_does_not_run_holds_the_offsets(launch: Launch, peer: Any) -> None:
     """By what its driver said before the node came, by its speed, and by a controller that ends."""
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    runs = peer.node.create_publisher(Bool, '/compensator/robot_running', latched)
+    runs = peer.node.create_publisher(Bool, '/compensator/robot_running', LATCHED)
     scaling = peer.node.create_publisher(Float64, '/compensator/speed_scaling', 5)
     states = peer.node.create_publisher(Float64, '/compensator/controller_state', 5)
     runs.publish(Bool(data=False))
@@ -251,32 +247,28 @@ def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> 
             states.publish(Float64())
 
     peer.node.create_timer(0.05, reported)
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE, '--controller-state', 'std_msgs/msg/Float64']
-    node = Program(command, env={'PYTHONWARNINGS': WARNINGS})
-    try:
-        peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: 'holding: the robot does not run' in node.text, 'that it does not run')
-        assert len(plant.offsets) == 1
-        runs.publish(Bool(data=True))
-        peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
-        for why in ('its speed scaling is 0', 'its state of the controller comes no more'):
-            stated = len(node.text)
-            scale, active = (0.0, True) if 'speed' in why else (1.0, False)
-            # A protective stop while the load changes: the arm must not be asked to leap when it ends.
-            # Both changes together move no offset by half of follow_error: until the stop is known,
-            # joints that do not follow would be another reason to hold, which only ~/enable ends.
-            plant.stands = True
-            plant.arm.force *= 1.2
-            peer.until(lambda stated=stated, why=why: f'run: {why}' in node.text[stated:], why)
-            held = len(plant.offsets) + 5
-            peer.until(lambda held=held: len(plant.offsets) > held + 20, 'offsets that are held')
-            assert np.ptp(plant.offsets[held:], axis=0).max() == 0.0
-            scale, active, plant.stands = 1.0, True, False
-            peer.until(lambda stated=stated: 'following' in node.text[stated:], 'following')
-        assert plant.step() <= WITHIN
-    finally:
-        node.end()
+    node = launch(*ARGUMENTS, '--controller-state', 'std_msgs/msg/Float64')
+    peer.until(lambda: plant.error() > 2e-3, 'a deflection')
+    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
+    peer.until(lambda: 'holding: the robot does not run' in node.text, 'that it does not run')
+    assert len(plant.offsets) == 1
+    runs.publish(Bool(data=True))
+    peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
+    for why in ('its speed scaling is 0', 'its state of the controller comes no more'):
+        stated = len(node.text)
+        scale, active = (0.0, True) if 'speed' in why else (1.0, False)
+        # A protective stop while the load changes: the arm must not be asked to leap when it ends.
+        # Both changes together move no offset by half of follow_error: until the stop is known,
+        # joints that do not follow would be another reason to hold, which only ~/enable ends.
+        plant.stands = True
+        plant.arm.force *= 1.2
+        peer.until(lambda stated=stated, why=why: f'run: {why}' in node.text[stated:], why)
+        held = len(plant.offsets) + 5
+        peer.until(lambda held=held: len(plant.offsets) > held + 20, 'offsets that are held')
+        assert np.ptp(plant.offsets[held:], axis=0).max() == 0.0
+        scale, active, plant.stands = 1.0, True, False
+        peer.until(lambda stated=stated: 'following' in node.text[stated:], 'following')
+    assert plant.step() <= WITHIN
 
 
 def test_a_controller_state_that_is_not_installed_is_rejected(domain: int) -> None:
@@ -287,22 +279,16 @@ def test_a_controller_state_that_is_not_installed_is_rejected(domain: int) -> No
 
 
 @pytest.mark.slow
-def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(domain: int, peer: Any, tmp_path: Path) -> None:
+def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(launch: Launch, peer: Any, tmp_path: Path) -> None:
     flag = tmp_path / 'flag'
-    plant = Plant(peer.node)
-    node = Program([sys.executable, '-c', BREAKS, str(flag), 'health', *ARGUMENTS, '--stale', STALE])
-    try:
-        peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
-        flag.touch()
-        peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
-        assert plant.step() <= WITHIN
-        peer.until(lambda: node.process.poll() is not None, 'its end')
-        assert node.process.returncode == 1
-        assert 'an error of its own' in node.text
-    finally:
-        node.end()
+    node = launch(str(flag), 'health', *ARGUMENTS, program=(sys.executable, '-c', BREAKS))
+    plant = following(peer)
+    flag.touch()
+    peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
+    assert plant.step() <= WITHIN
+    peer.until(lambda: node.process.poll() is not None, 'its end')
+    assert node.process.returncode == 1
+    assert 'an error of its own' in node.text
 
 
 OUT_OF_MEMORY = """
@@ -323,76 +309,56 @@ sys.exit(main())
     [(sys.executable, '-c', OUT_OF_MEMORY), ('sh', '-c', 'exec "$@" 2> /dev/full', 'sh', *PSD_DEFLECTION)],
     ids=['no memory', 'full log'],
 )
-def test_a_way_out_without_memory_or_log_leaves_no_offset(program: list[str], domain: int, peer: Any) -> None:
-    plant = Plant(peer.node)
-    node = Program([*program, *ARGUMENTS, '--stale', STALE])
-    try:
-        peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
-        if program[0] == 'sh':
-            node.process.send_signal(signal.SIGINT)
-        else:
-            peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
-        peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
-        assert plant.step() <= WITHIN
-    finally:
-        node.end()
+def test_a_way_out_without_memory_or_log_leaves_no_offset(program: list[str], launch: Launch, peer: Any) -> None:
+    node = launch(*ARGUMENTS, program=program)
+    plant = following(peer)
+    if program[0] == 'sh':
+        node.process.send_signal(signal.SIGINT)
+    else:
+        peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
+    peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
+    assert plant.step() <= WITHIN
 
 
 @pytest.mark.slow
-def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> None:
+def test_killed_and_started_again_it_makes_no_step(launch: Launch, peer: Any) -> None:
     """The controller keeps the offsets that it had, and says so; ours begin there. Two at once hold."""
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE]
-    plant = Plant(peer.node)
-    first = Program(command)
-    second: Program | None = None
-    try:
-        peer.until(lambda: plant.error() > 2e-3, 'a deflection')
-        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
-        first.process.kill()
-        first.wait()
-        heard, held = len(plant.offsets), plant.offsets[-1]
-        assert np.any(held)
-        first = Program(command)
-        peer.until(lambda: 'once it is enabled' in first.text, 'the node')
-        states = peer.collect(DiagnosticArray, '/diagnostics')
-        count = len(plant.offsets)
-        peer.until(lambda: len(states) > 1, 'diagnostics of the second')
-        assert len(plant.offsets) == count
-        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: 'following' in first.text, 'that it follows')
-        peer.until(lambda: len(plant.offsets) > heard + 50, 'offsets')
-        assert plant.step() <= WITHIN
-        second = Program([*command, '--ros-args', '-r', '__node:=other', '-r', '/other/offsets:=/compensator/offsets'])
-        peer.until(lambda: 'another node publishes /compensator/offsets' in first.text, 'that it is not alone')
-        assert peer.call(SetBool, '/other/enable', SetBool.Request(data=True)).success
-        peer.until(lambda: 'holding: another node publishes' in second.text, 'that the other is not alone')
-        now = len(plant.offsets)
-        peer.until(lambda: len(plant.offsets) > now + 50, 'offsets')
-        assert np.ptp(plant.offsets[now:], axis=0).max() == 0.0
-        assert plant.step() <= WITHIN
-    finally:
-        for one in (first, second):
-            if one is not None:
-                one.end()
+    first = launch(*ARGUMENTS)
+    plant = following(peer)
+    first.process.kill()
+    first.wait()
+    heard, held = len(plant.offsets), plant.offsets[-1]
+    assert np.any(held)
+    first = launch(*ARGUMENTS)
+    peer.until(lambda: 'once it is enabled' in first.text, 'the node')
+    states = peer.collect(DiagnosticArray, '/diagnostics')
+    count = len(plant.offsets)
+    peer.until(lambda: len(states) > 1, 'diagnostics of the second')
+    assert len(plant.offsets) == count
+    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
+    peer.until(lambda: 'following' in first.text, 'that it follows')
+    peer.until(lambda: len(plant.offsets) > heard + 50, 'offsets')
+    assert plant.step() <= WITHIN
+    second = launch(*ARGUMENTS, '--ros-args', '-r', '__node:=other', '-r', '/other/offsets:=/compensator/offsets')
+    peer.until(lambda: 'another node publishes /compensator/offsets' in first.text, 'that it is not alone')
+    assert peer.call(SetBool, '/other/enable', SetBool.Request(data=True)).success
+    peer.until(lambda: 'holding: another node publishes' in second.text, 'that the other is not alone')
+    now = len(plant.offsets)
+    peer.until(lambda: len(plant.offsets) > now + 50, 'offsets')
+    assert np.ptp(plant.offsets[now:], axis=0).max() == 0.0
+    assert plant.step() <= WITHIN
 
 
-def test_without_a_file_the_arm_is_the_one_of_robot_description(domain: int, peer: Any) -> None:
-    words = (*PSD_DEFLECTION, 'compensator', '--ros-args', '-p', 'tip:=tool', '-p', 'drive:=true')
-    node = Program(words, env={'PYTHONWARNINGS': WARNINGS})
-    try:
-        node.until('waiting for the robot on /robot_description')
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        peer.node.create_publisher(String, '/robot_description', latched).publish(String(data=URDF.read_text()))
-        node.until('publishing /compensator/offsets for shoulder, elbow, once it is enabled')
-    finally:
-        assert node.end() == 0
+def test_without_a_file_the_arm_is_the_one_of_robot_description(launch: Launch, peer: Any) -> None:
+    node = launch('compensator', '--ros-args', '-p', 'tip:=tool', '-p', 'drive:=true')
+    node.until('waiting for the robot on /robot_description')
+    peer.node.create_publisher(String, '/robot_description', LATCHED).publish(String(data=URDF.read_text()))
+    node.until('publishing /compensator/offsets for shoulder, elbow, once it is enabled')
+    assert node.end() == 0
 
 
 @pytest.mark.slow
-def test_a_signal_ends_the_waiting_for_robot_description(domain: int) -> None:
-    node = Program((*PSD_DEFLECTION, 'compensator', '--tip', 'tool'), env={'PYTHONWARNINGS': WARNINGS})
+def test_a_signal_ends_the_waiting_for_robot_description(launch: Launch) -> None:
+    node = launch('compensator', '--tip', 'tool')
     node.until('waiting for the robot on /robot_description')
     assert node.end() == 0, node.lines

@@ -9,6 +9,7 @@ A profile says what a node is asked with; a text in its place says why the check
 from __future__ import annotations
 
 import ast
+import contextlib
 import importlib
 import math
 import re
@@ -39,7 +40,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blind.render import Pose, Scene, photograph
 from psd_deflection.ros.topics import FOLLOW, HEARD, PUBLISHED, SERVED
-from test.ros.conftest import WARNINGS, Peer, stamp
+from test.ros.conftest import LATCHED, WARNINGS, Peer, stamp
 from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
@@ -191,8 +192,7 @@ def photo(sec: int, size: int = 0) -> Image:
 
 def sum_min_acts(running: Running) -> bool:
     """The rig that the node tells has it."""
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    reported = running.peer.collect(String, f'{NAMESPACE}/link_tip/rig', latched)
+    reported = running.peer.collect(String, f'{NAMESPACE}/link_tip/rig', LATCHED)
     running.peer.until(lambda: bool(reported), 'the rig')
     return '"sum_min": 2.25' in reported[-1].data or '"sum_min":2.25' in reported[-1].data
 
@@ -354,9 +354,8 @@ PROFILES: Mapping[str, Profile] = {
 
 @pytest.fixture(scope='module')
 def complete_peer(domain: int) -> Iterator[Peer]:
-    one = Peer()
-    yield one
-    one.close()
+    with contextlib.closing(Peer()) as one:
+        yield one
 
 
 @pytest.fixture(scope='module', params=nodes_of_setup())
@@ -403,13 +402,6 @@ def rejects(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
     return running.program.process.poll() is None
 
 
-def rejected_kind(running: Running, kind: str, *words: str) -> None:
-    sent = running.profile.rejected[kind]
-    if isinstance(sent, str):
-        pytest.skip(sent)
-    assert rejects(running, sent, words)
-
-
 def test_parameters_are_described(running: Running) -> None:
     described = running.described()
     assert described
@@ -420,9 +412,8 @@ def test_numbers_have_bounds(running: Running) -> None:
     numbers = [d for d in running.described() if d.type in (Parameter.Type.DOUBLE.value, Parameter.Type.INTEGER.value)]
     if not numbers:
         pytest.skip('none of its parameters is a number')
-    assert [
-        d.name for d in numbers if not (d.floating_point_range or d.integer_range or d.additional_constraints)
-    ] == []
+    free = [d.name for d in numbers if not (d.floating_point_range or d.integer_range or d.additional_constraints)]
+    assert free == []
 
 
 def test_parameter_file_is_read(running: Running) -> None:
@@ -430,22 +421,14 @@ def test_parameter_file_is_read(running: Running) -> None:
 
 
 @pytest.mark.parametrize('name', nodes_of_setup())
-def test_unknown_parameter_ends_the_start(name: str, domain: int, tmp_path: Path) -> None:
-    command = [*PSD_DEFLECTION, name, *PROFILES[name].words, '--ros-args', '-p', 'max_ofset:=0.5']
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, check=False)
-    assert ended.returncode == 3, ended.stderr
-    assert 'max_ofset' in ended.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('name', nodes_of_setup())
-def test_value_out_of_bounds_ends_the_start(name: str, domain: int, tmp_path: Path) -> None:
-    parameter, value = PROFILES[name].beyond
+@pytest.mark.parametrize('why', ['unknown', pytest.param('out of bounds', marks=pytest.mark.slow)])
+def test_invalid_parameter_ends_the_start(name: str, why: str, domain: int, tmp_path: Path) -> None:
+    parameter, value = PROFILES[name].beyond if why == 'out of bounds' else ('max_ofset', 0.5)
     command = [*PSD_DEFLECTION, name, *PROFILES[name].words, '--ros-args', '-p', f'{parameter}:={value}']
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr
     assert parameter in ended.stderr
-    assert 'must be' in ended.stderr
+    assert why == 'unknown' or 'must be' in ended.stderr
 
 
 def test_unknown_parameter_cannot_be_set(running: Running) -> None:
@@ -539,32 +522,28 @@ def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
 
     try:
         running.peer.until_sent(lambda: reported(1234), of_that_time, 'diagnostics in simulated time')
-        running.peer.until_sent(
-            lambda: reported(-5), lambda: running.rejections() > rejected, 'the rejection of a time before 1970'
-        )
+        before_1970 = 'the rejection of a time before 1970'
+        running.peer.until_sent(lambda: reported(-5), lambda: running.rejections() > rejected, before_1970)
     finally:
         running.peer.node.destroy_publisher(clock)
         assert running.set('use_sim_time', False).successful
 
 
-def test_not_a_number_is_rejected(running: Running) -> None:
-    rejected_kind(running, 'nan', 'nan', 'finite')
-
-
-def test_absurd_number_is_rejected(running: Running) -> None:
-    rejected_kind(running, 'huge', '1e+300', 'beyond')
-
-
-def test_other_frame_is_rejected(running: Running) -> None:
-    rejected_kind(running, 'frame', 'frame_id')
-
-
-def test_stamp_that_is_no_time_is_rejected(running: Running) -> None:
-    rejected_kind(running, 'stamp', 'is no time')
-
-
-def test_oversized_message_is_rejected(running: Running) -> None:
-    rejected_kind(running, 'size', ' bytes: must be at most')
+@pytest.mark.parametrize(
+    ('kind', 'words'),
+    [
+        ('nan', ('nan', 'finite')),
+        ('huge', ('1e+300', 'beyond')),
+        ('frame', ('frame_id',)),
+        ('stamp', ('is no time',)),
+        ('size', (' bytes: must be at most',)),
+    ],
+)
+def test_message_that_cannot_be_used_is_rejected(running: Running, kind: str, words: tuple[str, ...]) -> None:
+    sent = running.profile.rejected[kind]
+    if isinstance(sent, str):
+        pytest.skip(sent)
+    assert rejects(running, sent, words)
 
 
 def test_rejections_are_warnings(running: Running) -> None:

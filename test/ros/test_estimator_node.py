@@ -92,8 +92,7 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     matched = [p for p in poses if any(abs(stamp(p) - t - 9_500_000) < 50_000 for t in starts)]
     assert len(matched) > 200
     assert abs(time.time_ns() - stamp(poses[-1])) < 10 * 10**9
-    assert clouds[0].width == 20
-    assert clouds[0].point_step == 32
+    assert (clouds[0].width, clouds[0].point_step) == (20, 32)
     assert abs(poses[0].pose.orientation.w) > 0.99
     covariance = np.array(wide[-1].pose.covariance).reshape(6, 6)
     assert 1e-8 < math.sqrt(covariance[0, 0]) < 1e-6
@@ -121,13 +120,8 @@ def test_another_vendors_dds_sees_the_same_values(start: Callable[..., Any], pee
     # A process of its own, without the libraries that rclpy brought along.
     clean = {k: v for k, v in os.environ.items() if k not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')}
     script = Path(__file__).parent / 'cyclone_subscriber.py'
-    other = subprocess.Popen(
-        [sys.executable, str(script), 'rt/link_tip/deflection', '50'],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=clean,
-    )
+    command, pipe = [sys.executable, str(script), 'rt/link_tip/deflection', '50'], subprocess.PIPE
+    other = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=clean)
     peer.until(lambda: other.poll() is not None, 'the other vendor to have 50 messages')
     stdout, stderr = other.communicate()
     assert other.returncode == 0, (other.returncode, stderr, len(poses))
@@ -137,18 +131,14 @@ def test_another_vendors_dds_sees_the_same_values(start: Callable[..., Any], pee
     common = sorted(set(observed) & set(ours))
     assert len(common) >= 45
     for t in common:
-        p = ours[t]
-        o = p.pose.orientation
-        assert observed[t] == [
-            *(p.header.frame_id, p.pose.position.x, p.pose.position.y, p.pose.position.z, o.x, o.y, o.z, o.w),
-        ]
+        at, o = ours[t].pose.position, ours[t].pose.orientation
+        assert observed[t] == [ours[t].header.frame_id, at.x, at.y, at.z, o.x, o.y, o.z, o.w]
 
 
 def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str) -> None:
     rig = tmp_path / 'rig.yaml'
-    rig.write_text(
-        f'estimator:\n  ros__parameters:\n    bag_dir: {tmp_path / "bags"}\n    psd_1:\n      zero: [0.0002, 0.0001]\n'
-    )
+    lines = f'    bag_dir: {tmp_path / "bags"}\n    psd_1:\n      zero: [0.0002, 0.0001]\n'
+    rig.write_text(f'estimator:\n  ros__parameters:\n{lines}')
     daemon = start('--params-file', str(rig), '--port', simulated_port)
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
     peer.until(lambda: len(poses) >= 30, 'estimates')
@@ -195,8 +185,7 @@ def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any
     held = {name: list(value) if isinstance(value, array.array) else value for name, value in held.items()}
     assert held['psd_1.axes'] == ['-y', '+x']
     assert held['psd_2.axes'] == ['+x', '+y']
-    first.send(signal.SIGINT)
-    assert first.wait() == 0, first.lines
+    assert first.end() == 0, first.lines
     # As ros2 param dump writes it, which leaves a y without quotes.
     dump = tmp_path / 'dump.yaml'
     dump.write_text(yaml.dump({'/estimator': {'ros__parameters': held}}))
@@ -212,8 +201,7 @@ def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any
 def test_the_log_file_of_the_process_has_the_lines(start: Callable[..., Any], tmp_path: Path) -> None:
     daemon = start('--ros-args', '-p', f'zero_file:={tmp_path}', '--log-level', 'warn', '--log-file-name', 'tip')
     daemon.until('no port given')
-    daemon.send(signal.SIGINT)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end() == 0, daemon.lines
     (file,) = Path(os.environ['ROS_LOG_DIR']).glob(f'tip_{daemon.process.pid}_*.log')
     (line,) = file.read_text().splitlines()
     assert re.fullmatch(r'\[WARN\] \[\d+\.\d{9}\] \[estimator\]: no port given: started the simulated rig .*', line)
@@ -236,8 +224,7 @@ def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., An
         assert len(found) >= 200
         for vector, row in found:
             assert (vector.x, vector.y, vector.z) == tuple(row[f'{c}{number}'] for c in ('x', 'y', 'sum'))
-    daemon.send(signal.SIGINT)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end() == 0, daemon.lines
     (folder,) = tmp_path.glob('psd_*')
     with Reader(folder) as bag:
         kept = {c.topic for c in bag.connections}
@@ -302,8 +289,7 @@ def test_a_signal_ends_it_after_a_step_of_the_system_clock(
     stated = f'the system clock was set by {"+3600." if step_s > 0 else "-3"}'
     peer.until(lambda: any(s.message.startswith(stated) for r in reports for s in r.status), 'the step')
     began = time.monotonic()
-    daemon.send(signal.SIGINT)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end() == 0, daemon.lines
     assert time.monotonic() - began < 8.0
     (folder,) = tmp_path.glob('psd_*')
     assert main(['replay', str(folder), '--compare']) == 0

@@ -9,6 +9,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -31,7 +32,7 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros import estimator, node
 from psd_deflection.ros.running import OTHER_CHOICES, TRANSPORTS, ros
 from test.heard import WAIT_S
-from test.ros.conftest import PATIENT, stamp
+from test.ros.conftest import LATCHED, PATIENT, stamp
 
 pytestmark = pytest.mark.ros
 
@@ -51,12 +52,8 @@ def parameters(peer: Any, *names: str) -> list[Any]:
 
 def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path) -> None:
     bags = tmp_path / 'bags'
-    daemon = start(
-        '--port',
-        simulated_port,
-        '--ros-args',
-        *('-p', 'autostart:=false', '-p', f'bag_dir:={bags}', '-p', 'record:=true', '-p', 'markers:=true'),
-    )
+    words = ('autostart:=false', f'bag_dir:={bags}', 'record:=true', 'markers:=true')
+    daemon = start('--port', simulated_port, '--ros-args', *(w for word in words for w in ('-p', word)))
     daemon.until('waiting to be configured')
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
@@ -102,8 +99,7 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert change(peer, Transition.TRANSITION_CONFIGURE)
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     peer.until(lambda: len(poses) >= stopped + 10, 'estimates once more')
-    daemon.send(signal.SIGINT)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end() == 0, daemon.lines
 
 
 def put(peer: Any, **values: object) -> str:
@@ -129,13 +125,9 @@ def value_of(peer: Any, name: str) -> Any:
 def test_parameters_set_unconfigured_are_kept(
     start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
 ) -> None:
-    daemon = start(
-        '--port',
-        '/dev/nothing_here',
-        '--ros-args',
-        *('-p', 'autostart:=false', '-p', f'zero_file:={tmp_path / "zero.json"}'),
-        *('-p', 'effects.axis_crosstalk.psd:=1', '-p', 'effects.axis_crosstalk.xy:=0.01'),
-    )
+    words = ['autostart:=false', f'zero_file:={tmp_path / "zero.json"}']
+    words += ['effects.axis_crosstalk.psd:=1', 'effects.axis_crosstalk.xy:=0.01']
+    daemon = start('--port', '/dev/nothing_here', '--ros-args', *(w for word in words for w in ('-p', word)))
     daemon.until('waiting to be configured')
     assert not change(peer, Transition.TRANSITION_CONFIGURE)
     daemon.until('no such port')
@@ -150,7 +142,7 @@ def test_parameters_set_unconfigured_are_kept(
     assert value_of(peer, 'solver') == 'exact'
     assert put(peer, port=simulated_port, solver='ols', block_size=10, sum_min=2.4, markers=True) == ''
     assert put(peer, effects__axis_crosstalk__xy=0.02) == ''
-    rigs = peer.collect(String, '/link_tip/rig', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    rigs = peer.collect(String, '/link_tip/rig', LATCHED)
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
     own = peer.collect(PoseStamped, '/link_tip/ols/deflection')
     markers = peer.collect(MarkerArray, '/link_tip/markers')
@@ -183,8 +175,7 @@ def test_parameters_set_unconfigured_are_kept(
     assert put(peer, psd_1__zero=[0.0004, 0.0]) == ''
     cycle(peer, 'configure')
     assert parameters(peer, 'psd_1.zero') == [[0.0004, 0.0]]
-    daemon.send(signal.SIGINT)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end() == 0, daemon.lines
 
 
 def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable[..., Any], peer: Any) -> None:
@@ -195,8 +186,7 @@ def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable
     peer.until(lambda: any('no such port' in m.msg and m.level == 40 for m in log), 'the error on /rosout')
     assert not any('waiting to be configured' in line for line in daemon.lines)
     assert state(peer) == State.PRIMARY_STATE_UNCONFIGURED
-    daemon.send(signal.SIGTERM)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end(signal.SIGTERM) == 0, daemon.lines
 
 
 @pytest.mark.slow
@@ -205,47 +195,42 @@ def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], devic
     device.answer = b''
     daemon = start('--port', str(device.link), script=PATIENT)
     assert device.greeted.wait(WAIT_S)
-    daemon.send(number)
-    assert daemon.wait() == 0, daemon.lines
+    assert daemon.end(number) == 0, daemon.lines
     assert not any('Traceback' in line for line in daemon.lines)
 
 
 def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*arguments: Any) -> Any:
-        raise ZeroDivisionError('of our own making')
-
-    monkeypatch.setattr(estimator, 'Session', broken)
+    monkeypatch.setattr(estimator, 'Session', Mock(side_effect=ZeroDivisionError('of our own making')))
     with pytest.raises(ZeroDivisionError, match='of our own making'):
         estimator.run(['--ros-args'], {}, null_log)
 
 
 def test_a_rejection_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def rejected(*args: Any, **options: Any) -> Any:
-        raise RuntimeError('error creating node: no security libraries\nPlease compile')
-
-    monkeypatch.setattr(node, '_ManagedNode', rejected)
+    rejected = RuntimeError('error creating node: no security libraries\nPlease compile')
+    monkeypatch.setattr(node, '_ManagedNode', Mock(side_effect=rejected))
     with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
         estimator.run(['--ros-args'], {}, null_log)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('shared_memory', [False, True])
-def test_a_process_that_is_killed_makes_no_other_deaf(
-    domain: int, monkeypatch: pytest.MonkeyPatch, shared_memory: bool
-) -> None:
+@pytest.fixture
+def no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
     for choice in OTHER_CHOICES:
         monkeypatch.setenv(choice, '')
         monkeypatch.delenv(choice)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('shared_memory', [False, True])
+@pytest.mark.usefixtures('domain', 'no_choice')
+def test_a_process_that_is_killed_makes_no_other_deaf(shared_memory: bool) -> None:
     with ros('one', [], shared_memory):
         assert os.environ.get(TRANSPORTS) == (None if shared_memory else 'UDPv4')
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('choice', OTHER_CHOICES)
-def test_the_choice_of_the_user_stays(domain: int, monkeypatch: pytest.MonkeyPatch, choice: str) -> None:
-    for one in OTHER_CHOICES:
-        monkeypatch.setenv(one, '')
-        monkeypatch.delenv(one)
+@pytest.mark.usefixtures('domain', 'no_choice')
+def test_the_choice_of_the_user_stays(monkeypatch: pytest.MonkeyPatch, choice: str) -> None:
     monkeypatch.setenv(choice, 'SHM' if choice == TRANSPORTS else '')
     with ros('one', []):
         assert os.environ.get(TRANSPORTS) == ('SHM' if choice == TRANSPORTS else None)

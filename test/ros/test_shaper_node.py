@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -27,7 +27,7 @@ from bench.shapers import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, pla
 from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving
 from psd_deflection.arms.compensation.trajectory import checked
 from psd_deflection.ros.endpoints import GuardedServer
-from test.ros.conftest import WARNINGS, Peer, stamp
+from test.ros.conftest import LATCHED, WARNINGS, Peer, stamp
 from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
@@ -38,12 +38,10 @@ URDF = ROOT / 'config' / 'two_links.urdf'
 
 
 @pytest.fixture
-def node(domain: int) -> Iterator[Program]:
-    one = Program([*PSD_DEFLECTION, 'shaper', *ZVD], env={'PYTHONWARNINGS': WARNINGS})
+def node(launch: Callable[..., Program]) -> Iterator[Program]:
+    one = launch('shaper', *ZVD)
     yield one
-    status = one.end()
-    print(*one.lines[-50:], sep='\n')
-    assert status == 0
+    assert one.end() == 0
 
 
 def message(*points: JointTrajectoryPoint, names: tuple[str, ...] = NAMES) -> JointTrajectory:
@@ -129,33 +127,28 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
 
 
 @pytest.mark.slow
-def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> None:
-    words = [*ZVD, '--urdf', 'robot_description']
-    node = Program([*PSD_DEFLECTION, 'shaper', *words], env={'PYTHONWARNINGS': WARNINGS})
-    try:
-        given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
-        heard = peer.collect(JointTrajectory, '/shaper/shaped')
-        peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
-        reported(peer, shoulder=START[0], elbow=START[1])
-        move_of = {'slow': (2.0 * MOVE_S, END.tolist()), 'far': (MOVE_S, [1e3, 0.0])}
+def test_the_limits_come_from_the_robots_description(launch: Callable[..., Program], peer: Any) -> None:
+    node = launch('shaper', *ZVD, '--urdf', 'robot_description')
+    given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
+    heard = peer.collect(JointTrajectory, '/shaper/shaped')
+    peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
+    reported(peer, shoulder=START[0], elbow=START[1])
+    move_of = {'slow': (2.0 * MOVE_S, END.tolist()), 'far': (MOVE_S, [1e3, 0.0])}
 
-        def rejected(why: str, kind: str) -> None:
-            good = message(point(0.0, START.tolist()), point(*move_of[kind]))
-            peer.until(lambda: given.publish(good) or why in node.text, why)
+    def rejected(why: str, kind: str) -> None:
+        good = message(point(0.0, START.tolist()), point(*move_of[kind]))
+        peer.until(lambda: given.publish(good) or why in node.text, why)
 
-        rejected('trajectory rejected: nobody has told the limits of the joints on robot_description yet', 'slow')
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        described = peer.node.create_publisher(String, '/robot_description', latched)
-        described.publish(String(data='<robot'))
-        peer.until(lambda: 'robot_description: rejected' in node.text, 'a rejection of what is no URDF')
-        described.publish(String(data=URDF.read_text()))
-        peer.until(lambda: 'limits of shoulder, elbow' in node.text, 'the limits')
-        rejected('trajectory rejected: shoulder', 'far')
-        good = message(point(0.0, START.tolist()), point(*move_of['slow']))
-        peer.until(lambda: given.publish(good) or bool(heard), 'the shaped trajectory')
-    finally:
-        assert node.end() == 0
-    print(node.text)
+    rejected('trajectory rejected: nobody has told the limits of the joints on robot_description yet', 'slow')
+    described = peer.node.create_publisher(String, '/robot_description', LATCHED)
+    described.publish(String(data='<robot'))
+    peer.until(lambda: 'robot_description: rejected' in node.text, 'a rejection of what is no URDF')
+    described.publish(String(data=URDF.read_text()))
+    peer.until(lambda: 'limits of shoulder, elbow' in node.text, 'the limits')
+    rejected('trajectory rejected: shoulder', 'far')
+    good = message(point(0.0, START.tolist()), point(*move_of['slow']))
+    peer.until(lambda: given.publish(good) or bool(heard), 'the shaped trajectory')
+    assert node.end() == 0
 
 
 def test_settings_are_parameters(node: Program, peer: Any) -> None:
@@ -171,9 +164,8 @@ def test_settings_are_parameters(node: Program, peer: Any) -> None:
     given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
     reported(peer, shoulder=0.0, elbow=0.02)
-    peer.until(
-        lambda: given.publish(message(point(0.0, [0.0, 0.0]))) or 'from where elbow is' in node.text, 'a rejection'
-    )
+    far = message(point(0.0, [0.0, 0.0]))
+    peer.until(lambda: given.publish(far) or 'from where elbow is' in node.text, 'a rejection')
     assert 'must be at most 0.01' in node.text
 
 
@@ -222,9 +214,7 @@ class Arm:
         return len(observed) == 2 and all(s.level == DiagnosticStatus.OK for s in observed.values())
 
     def goal(self, end: tuple[float, ...] = (0.5, 0.1), seconds: float = 0.3, names: tuple[str, ...] = JOINTS) -> Any:
-        at = Duration(nanoseconds=round(1e9 * seconds)).to_msg()
-        point = JointTrajectoryPoint(time_from_start=at, positions=list(end), velocities=[0.0] * len(end))
-        return self.action.Goal(trajectory=JointTrajectory(joint_names=list(names), points=[point]))
+        return self.action.Goal(trajectory=message(point(seconds, list(end)), names=names))
 
     def send(self, goal: Any) -> Any:
         """The client's handle of a goal, once the shaper has answered."""
@@ -254,6 +244,9 @@ class Arm:
         return self.away() > 0.02
 
 
+Begin = Callable[..., Arm]
+
+
 @pytest.fixture(scope='session')
 def control_msgs() -> None:
     if not available():
@@ -261,7 +254,7 @@ def control_msgs() -> None:
 
 
 @pytest.fixture
-def begin(control_msgs: None, domain: int, peer: Peer) -> Iterator[Callable[..., Arm]]:
+def begin(control_msgs: None, domain: int, peer: Peer) -> Iterator[Begin]:
     arms: list[Arm] = []
 
     def make(*words: str) -> Arm:
@@ -280,7 +273,7 @@ def begin(control_msgs: None, domain: int, peer: Peer) -> Iterator[Callable[...,
             arm.controller.close()
 
 
-def test_goal_is_shaped_with_result_of_controller(begin: Callable[..., Arm]) -> None:
+def test_goal_is_shaped_with_result_of_controller(begin: Begin) -> None:
     arm = begin()
     goal = arm.goal()
     from control_msgs.msg import JointTolerance
@@ -305,7 +298,7 @@ def test_goal_is_shaped_with_result_of_controller(begin: Callable[..., Arm]) -> 
 
 
 @pytest.mark.slow
-def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Callable[..., Arm]) -> None:
+def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Begin) -> None:
     arm = begin()
     first = arm.send(arm.goal(seconds=2.0))
     arm.peer.until(arm.moves, 'motion')
@@ -322,7 +315,7 @@ def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Callable[..
 
 
 @pytest.mark.slow
-def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Callable[..., Arm]) -> None:
+def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Begin) -> None:
     arm = begin()
     handle = arm.send(arm.goal(seconds=2.0))
     arm.peer.until(arm.moves, 'motion')
@@ -341,7 +334,7 @@ def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Callable[...,
 
 
 @pytest.mark.slow
-def test_joints_that_stand_are_believed_and_no_feedback(begin: Callable[..., Arm]) -> None:
+def test_joints_that_stand_are_believed_and_no_feedback(begin: Begin) -> None:
     arm = begin()
     arm.stuck = True
     first = arm.send(arm.goal(seconds=6.0))
@@ -355,8 +348,8 @@ def test_joints_that_stand_are_believed_and_no_feedback(begin: Callable[..., Arm
 
 
 @pytest.mark.slow
-def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Callable[..., Arm]) -> None:
-    arm = begin('--urdf', str(ROOT / 'config' / 'two_links.urdf'), *WORDS)
+def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Begin) -> None:
+    arm = begin('--urdf', str(URDF), *WORDS)
     assert arm.controller is not None
 
     def aborted(goal: Any, code: int, why: str) -> None:
@@ -384,7 +377,7 @@ def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Callable[...,
 
 
 @pytest.mark.slow
-def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) -> None:
+def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Begin) -> None:
     arm = begin()
 
     def rejected(goal: Any, why: str) -> None:
@@ -410,7 +403,7 @@ def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) 
 
 
 @pytest.mark.slow
-def test_a_flood_of_goals_is_cut_off(begin: Callable[..., Arm]) -> None:
+def test_a_flood_of_goals_is_cut_off(begin: Begin) -> None:
     arm = begin()
 
     def flooded() -> bool:
@@ -422,7 +415,7 @@ def test_a_flood_of_goals_is_cut_off(begin: Callable[..., Arm]) -> None:
 
 
 @pytest.mark.slow
-def test_what_no_client_of_ros_sends_ends_nothing(begin: Callable[..., Arm]) -> None:
+def test_what_no_client_of_ros_sends_ends_nothing(begin: Begin) -> None:
     arm = begin()
     for kind in ('half', 'text'):
         topic = f'rq{FOLLOW}/_action/send_goalRequest'
@@ -445,7 +438,7 @@ def test_what_no_client_of_ros_sends_ends_nothing(begin: Callable[..., Arm]) -> 
 
 
 @pytest.mark.slow
-def test_a_controller_that_is_not_there_ends_a_goal_at_once(begin: Callable[..., Arm]) -> None:
+def test_a_controller_that_is_not_there_ends_a_goal_at_once(begin: Begin) -> None:
     arm = begin()
     assert arm.controller is not None
     handle = arm.send(arm.goal(seconds=20.0))
@@ -465,7 +458,7 @@ def test_a_controller_that_is_not_there_ends_a_goal_at_once(begin: Callable[...,
 
 
 @pytest.mark.slow
-def test_a_controller_that_says_nothing_more_ends_a_goal(begin: Callable[..., Arm]) -> None:
+def test_a_controller_that_says_nothing_more_ends_a_goal(begin: Begin) -> None:
     arm = begin()
     assert arm.controller is not None
     handle = arm.send(arm.goal(seconds=1.0))
@@ -477,19 +470,13 @@ def test_a_controller_that_says_nothing_more_ends_a_goal(begin: Callable[..., Ar
 
 
 @pytest.mark.slow
-def test_a_controller_that_does_not_answer_ends_a_goal(
-    begin: Callable[..., Arm], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_controller_that_does_not_answer_ends_a_goal(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
     arm = begin()
     assert arm.controller is not None
 
-    async def deaf(taken_data: Any) -> None:
-        pass
-
     with monkeypatch.context() as patched:
-        patched.setattr(arm.controller._server, 'execute', deaf)
-        first, second = arm.send(arm.goal()), arm.send(arm.goal())
-        for handle in (first, second):
+        patched.setattr(arm.controller._server, 'execute', AsyncMock())
+        for handle in [arm.send(arm.goal()) for _ in range(2)]:
             response = arm.result(handle)
             assert (response.status, response.result.error_code) == (ABORTED, -1)
             assert f'{ACTION} has not answered within 2 s' in response.result.error_string
@@ -503,9 +490,7 @@ def test_what_rclpy_cannot_take_is_rejected(control_msgs: None, peer: Peer, monk
     node = rclpy.create_node('served', context=peer.context)
     server = GuardedServer(node, FollowJointTrajectory, '/goals', rejected.append, print, print, print)
 
-    def broken(self: Any) -> None:
-        raise UnicodeDecodeError('utf-8', b'x', 0, 1, '/a/path of the library')
-
+    broken = Mock(side_effect=UnicodeDecodeError('utf-8', b'x', 0, 1, '/a/path of the library'))
     monkeypatch.setattr(rclpy.action.ActionServer, 'take_data', broken)
     assert server.take_data() == {}
     assert rejected == ['no message of this type']
@@ -514,7 +499,7 @@ def test_what_rclpy_cannot_take_is_rejected(control_msgs: None, peer: Peer, monk
 
 
 @pytest.mark.slow
-def test_a_stopped_shaper_stops_the_arm(begin: Callable[..., Arm]) -> None:
+def test_a_stopped_shaper_stops_the_arm(begin: Begin) -> None:
     arm = begin()
     handle = arm.send(arm.goal(seconds=20.0))
     arm.peer.until(arm.moves, 'motion')
@@ -527,16 +512,10 @@ def test_a_stopped_shaper_stops_the_arm(begin: Callable[..., Arm]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ('words', 'why'),
-    [
-        (('--action', 'a b'), "action = 'a b'"),
-        (('--action', FOLLOW), 'must be the action of a controller, not our own'),
-    ],
+    ('action', 'why'), [('a b', "action = 'a b'"), (FOLLOW, 'must be the action of a controller, not our own')]
 )
-def test_an_action_that_cannot_be_is_rejected(
-    control_msgs: None, domain: int, words: tuple[str, ...], why: str
-) -> None:
-    command = [*PSD_DEFLECTION, 'shaper', '--shaper', 'none', *words]
+def test_an_action_that_cannot_be_is_rejected(control_msgs: None, domain: int, action: str, why: str) -> None:
+    command = [*PSD_DEFLECTION, 'shaper', '--shaper', 'none', '--action', action]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr
     assert why in ended.stderr

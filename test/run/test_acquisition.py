@@ -4,6 +4,7 @@
 
 import itertools
 import queue
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import INFO, WARNING, null_log, texts
+from psd_deflection.base.log import INFO, WARNING, null_log
 from psd_deflection.devices import contract_frames, port_source
 from psd_deflection.devices.ports import SerialPort
 from psd_deflection.devices.protocol.frames import HelloFrame, PongFrame, SampleFrame, encode
@@ -28,16 +29,9 @@ from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.arrivals import Annotation, Arrival, Ended, Item, Restarted
 from psd_deflection.run.hello import PING_S, UNANSWERED, Pinger
 from test.heard import WAIT_S
+from test.run.conftest import HELLO
 
 pytestmark = pytest.mark.slow
-
-HELLO_INFO: dict[str, object] = {
-    'serial': 'T-1',
-    'firmware': 'test',
-    'sample_rate_hz': 1000.0,
-    'channels': ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2'],
-    'volts_per_count': 10.0 / 32768,
-}
 
 
 def take(acquisition: Acquisition, n: int) -> list[Item]:
@@ -60,15 +54,11 @@ class Run:
         self.acquisition.start()
 
     def heard(self, text: str) -> str:
-        """Wait for a message that holds ``text``."""
-        return self.heard_with(text)[0]
-
-    def heard_with(self, text: str) -> tuple[str, int]:
-        """The same with its severity."""
-        while True:
-            message, level = self.logged.get(timeout=WAIT_S)
-            if text in message:
-                return message, level
+        """Wait for a message that holds ``text``; ``level`` is its severity then."""
+        message = ''
+        while text not in message:
+            message, self.level = self.logged.get(timeout=WAIT_S)
+        return message
 
 
 @pytest.fixture
@@ -184,29 +174,32 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
-def test_a_missing_port_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r'nowhere: no such port; .*psd-deflection devices'):
-        Acquisition(load_rig(overrides={'port': str(tmp_path / 'nowhere')}), texts(print)).open()
+def not_opened(rig: Rig, why: str) -> None:
+    with pytest.raises(DeviceError, match=why):
+        Acquisition(rig, null_log).open()
 
 
-def test_a_file_is_not_a_serial_port(tmp_path: Path) -> None:
-    path = tmp_path / 'file.txt'
-    path.write_text('x')
-    with pytest.raises(DeviceError, match=r'file\.txt: not a serial port'):
-        Acquisition(load_rig(overrides={'port': str(path)}), texts(print)).open()
-    with pytest.raises(DeviceError, match=r'[^:]*: not a serial port$'):
-        Acquisition(load_rig(overrides={'port': str(tmp_path)}), texts(print)).open()
+@pytest.mark.parametrize(
+    ('name', 'why'),
+    [
+        ('nowhere', r'nowhere: no such port; .*psd-deflection devices'),
+        ('tty*', r'tty\*: no port of such a name .*psd-deflection devices'),
+        ('file.txt', r'file\.txt: not a serial port'),
+        ('', r'[^:]*: not a serial port$'),
+    ],
+)
+def test_a_port_that_is_none_is_named(tmp_path: Path, name: str, why: str) -> None:
+    (tmp_path / 'file.txt').write_text('x')
+    not_opened(load_rig(overrides={'port': str(tmp_path / name)}), why)
 
 
 def test_a_port_in_use_is_named(run: Run, rig: Rig) -> None:
-    with pytest.raises(DeviceError, match='another program has the port open'):
-        Acquisition(rig, texts(print)).open()
+    not_opened(rig, 'another program has the port open')
 
 
 def test_a_silent_device_is_named(device: Any, rig: Rig, short_wait: ModuleType) -> None:
     device.answer = b''
-    with pytest.raises(DeviceError, match=r'no frame in 0.2 s; is the device powered'):
-        Acquisition(rig, texts(print)).open()
+    not_opened(rig, r'no frame in 0.2 s; is the device powered')
 
 
 def read_rest(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
@@ -230,15 +223,13 @@ def read_rest(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
 def test_a_device_that_talks_something_else_is_named(device: Any, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     device.answer = b'$GPGGA,123519,4807.038,N\r\n'
     read_rest(monkeypatch, device.answer)
-    with pytest.raises(DeviceError, match=r'26 bytes but no frame .* baud rate'):
-        Acquisition(rig, texts(print)).open()
+    not_opened(rig, r'26 bytes but no frame .* baud rate')
 
 
 def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     device.answer = b'\x00' + encode(sample(1)) + encode(sample(2))
     read_rest(monkeypatch, device.answer)
-    with pytest.raises(DeviceError, match='samples come but no HELLO'):
-        Acquisition(rig, texts(print)).open()
+    not_opened(rig, 'samples come but no HELLO')
 
 
 @pytest.mark.parametrize(
@@ -256,14 +247,7 @@ def test_a_device_that_does_not_fit_is_named(
     device: Any, rig: Rig, hello: HelloFrame, version: int, info: dict[str, object], message: str
 ) -> None:
     device.answer = encode(HelloFrame(version, {**hello.info, **info}))
-    with pytest.raises(DeviceError) as error:
-        Acquisition(rig, texts(print)).open()
-    assert message in str(error.value)
-    assert rig.acquisition.port in str(error.value)
-
-
-def loss_of(run: Run) -> dict[str, int]:
-    return dict(run.acquisition.counters.lost_by)
+    not_opened(rig, f'{re.escape(rig.acquisition.port)}.*{message}')
 
 
 def test_every_lost_sample_has_a_cause(device: Any, run: Run, sample: Any) -> None:
@@ -275,13 +259,13 @@ def test_every_lost_sample_has_a_cause(device: Any, run: Run, sample: Any) -> No
     device.send(bytes(damaged))
     device.send_frames(sample(17), *[sample(s) for s in range(22, 40)])
     take(run.acquisition, 31)
-    assert loss_of(run) == {'dropped by the device': 3, 'damaged on the wire': 2, 'on the wire, without a trace': 4}
-    assert run.acquisition.counters.lost == 9
-    assert run.acquisition.counters.bad == 2
+    counters = run.acquisition.counters
+    by_cause = {'dropped by the device': 3, 'damaged on the wire': 2, 'on the wire, without a trace': 4}
+    assert (dict(counters.lost_by), counters.lost, counters.bad) == (by_cause, 9, 2)
 
 
 def test_renamed_device_is_recovered_by_serial_number(device: Any, tmp_path: Path, sample: Any) -> None:
-    device.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'MINE'}))
+    device.answer = encode(HelloFrame(1, {**HELLO.info, 'serial': 'MINE'}))
     run = Run(load_rig(overrides={'port': str(tmp_path / 'port*'), 'serial_number': 'MINE'}))
     try:
         device.send_frames(*[sample(s) for s in range(20)])
@@ -290,13 +274,13 @@ def test_renamed_device_is_recovered_by_serial_number(device: Any, tmp_path: Pat
         run.heard('waiting for it to come back')
         # Another device takes the old name, ours comes back under a new one.
         other = type(device)(tmp_path / 'port')
-        other.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'}))
+        other.answer = encode(HelloFrame(1, {**HELLO.info, 'serial': 'OTHER'}))
         device.link = tmp_path / 'port_b'
         device.plug()
         assert 'port_b: the device is back' in run.heard('the device is back')
         device.send_frames(*[sample(s) for s in range(1000, 1020)])
         assert numbers(take(run.acquisition, 20)) == list(range(1000, 1020))
-        assert loss_of(run) == {'while the port was away': 980}
+        assert dict(run.acquisition.counters.lost_by) == {'while the port was away': 980}
         other.unplug()
     finally:
         run.acquisition.stop()
@@ -305,23 +289,18 @@ def test_renamed_device_is_recovered_by_serial_number(device: Any, tmp_path: Pat
 def test_another_device_on_the_same_port_is_not_taken(device: Any, run: Run) -> None:
     device.unplug()
     run.heard('waiting for it to come back')
-    device.answer = encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'}))
+    device.answer = encode(HelloFrame(1, {**HELLO.info, 'serial': 'OTHER'}))
     device.plug()
     assert "serial number 'OTHER' and not 'T-1'" in run.heard('another device answers')
     device.unplug()
-    device.answer = encode(HelloFrame(1, HELLO_INFO))
+    device.answer = encode(HELLO)
     device.plug()
     run.heard('the device is back')
 
 
 def test_wanted_serial_number_holds_for_first_device(device: Any, rig: Rig) -> None:
-    with pytest.raises(DeviceError, match="serial number 'T-1' and not 'X'"):
-        Acquisition(load_rig(overrides={'port': rig.acquisition.port, 'serial_number': 'X'}), texts(print)).open()
-
-
-def test_a_pattern_without_a_port_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r'tty\*: no port of such a name .*psd-deflection devices'):
-        Acquisition(load_rig(overrides={'port': str(tmp_path / 'tty*')}), texts(print)).open()
+    other = load_rig(overrides={'port': rig.acquisition.port, 'serial_number': 'X'})
+    not_opened(other, "serial number 'T-1' and not 'X'")
 
 
 def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType, sample: Any) -> None:
@@ -343,7 +322,8 @@ def test_a_device_clock_jump_is_reported_and_stamps_increase(
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40)])
     before = take(run.acquisition, 40)
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40, 80)])
-    assert run.heard_with("the device's clock jumped")[1] == WARNING
+    run.heard("the device's clock jumped")
+    assert run.level == WARNING
     items = before + take(run.acquisition, 40)
     t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))
@@ -425,7 +405,19 @@ def test_a_clock_that_changes_its_rate_has_each_step_noted(rate: float, sample: 
     assert any('the time map steps' in line for line in fed.lines)
 
 
-class Clockwork(Source):
+class MadeUp(Source):
+    def open(self, timeout: float) -> HelloFrame:
+        return HELLO
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+class Clockwork(MadeUp):
     """1000 samples a second by a clock of its own, which goes on when the reader waits or rests."""
 
     def __init__(self, clock: Clock) -> None:
@@ -439,11 +431,6 @@ class Clockwork(Source):
         self.passed_s += rest
         self.rests.append(rest)
 
-    def open(self, timeout: float) -> HelloFrame:
-        return HelloFrame(1, HELLO_INFO)
-
-    def start(self) -> None: ...
-
     def read(self, timeout: float) -> Received:
         if self.given >= 40:
             raise SourceEndedError('forty are enough')
@@ -453,11 +440,6 @@ class Clockwork(Source):
         self.reads.append(there - self.given)
         self.given = there
         return Received(events, round(self.passed_s * 1e9), len(events))
-
-    def close(self) -> None: ...
-
-    def describe(self) -> dict[str, str]:
-        return {}
 
 
 @pytest.mark.parametrize('clock', [Clock.DEVICE, Clock.HOST])
@@ -479,21 +461,14 @@ def test_samples_gather_except_the_last_of_a_block(rig: Rig, monkeypatch: pytest
     assert (read_with[19], read_with[39]) == (1, 1)
 
 
-class Asked(Source):
-    """A sample and a ping's turn every half second, by its own clock. ``knows``: it answers pings."""
+class Asked(MadeUp):
+    """A sample and a ping's turn every half second, by its own clock."""
 
-    def __init__(self, reads: int, *, knows: bool, can_be_asked: bool = True) -> None:
+    def __init__(self, reads: int) -> None:
         self.name, self.clock = 'asked', Clock.DEVICE
-        self.now_ns = 0
-        self.asked = 0
-        self._reads, self._knows, self._can_be_asked = reads, knows, can_be_asked
-        self._given = 0
+        self.now_ns = self._given = 0
+        self._reads = reads
         self._cookies: list[int] = []
-
-    def open(self, timeout: float) -> HelloFrame:
-        return HelloFrame(1, HELLO_INFO)
-
-    def start(self) -> None: ...
 
     def read(self, timeout: float) -> Received:
         if self._given == self._reads:
@@ -501,20 +476,14 @@ class Asked(Source):
         self.now_ns += 500_000_000
         t_us = self.now_ns // 1000
         events: list[Event] = [Sample(0, 500 * self._given, t_us, (0, 0, 16384, 0, 0, 16384))]
-        events += [PongFrame(cookie, t_us) for cookie in self._cookies if self._knows]
+        events += [PongFrame(cookie, t_us) for cookie in self._cookies]
         self._cookies.clear()
         self._given += 1
         return Received(events, self.now_ns, len(events))
 
     def ping(self, cookie: int) -> bool:
-        self.asked += 1
         self._cookies.append(cookie)
-        return self._can_be_asked
-
-    def close(self) -> None: ...
-
-    def describe(self) -> dict[str, str]:
-        return {}
+        return True
 
 
 def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
@@ -532,7 +501,7 @@ def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
 
 
 def test_a_ping_is_answered_and_bounds_the_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    acquisition = pinged(Asked(30, knows=True), monkeypatch)
+    acquisition = pinged(Asked(30), monkeypatch)
     # The last one was asked when nothing more came.
     assert (acquisition.counters.pings, acquisition.counters.pongs) == (30, 29)
     assert acquisition.clock_state().round_trip_ns == 500_000_000

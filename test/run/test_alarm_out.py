@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Alarms handed on: a real program and a real web server on this machine."""
 
+import contextlib
 import json
 import os
 import shlex
@@ -25,6 +26,7 @@ from psd_deflection.run.alarm_out import AlarmOut, finding
 from test.heard import WAIT_S
 
 ALARM = Alarm(1_700_000_000_250_000_000, 1_700_000_004_000_000_000, 'x1', 5e-6, 0.2e-6, ('y1',))
+NOT_HANDED_ON = '; an alarm was not handed on, and further ones are counted'
 
 
 class Server:
@@ -64,9 +66,8 @@ class Server:
 
 @pytest.fixture
 def server() -> Iterator[Server]:
-    made = Server()
-    yield made
-    made.close()
+    with contextlib.closing(Server()) as made:
+        yield made
 
 
 @pytest.fixture(autouse=True)
@@ -114,14 +115,9 @@ def test_no_shell_reads_the_command(tmp_path: Path) -> None:
 def test_a_command_that_fails_is_reported_once_and_counted() -> None:
     out, stated = forwarded(python('import sys; sys.exit(3)'), times=3)
     assert (out.sent, out.failed) == (0, 3)
-    assert stated == [
-        f'watch: command {sys.executable}: ended with status 3; an alarm was not handed on, '
-        'and further ones are counted'
-    ]
-    assert out.values() == [
-        ('alarms handed on', '0'),
-        ('alarms not handed on', f'3 command {sys.executable}: ended with status 3'),
-    ]
+    failure = f'command {sys.executable}: ended with status 3'
+    assert stated == [f'watch: {failure}{NOT_HANDED_ON}']
+    assert out.values() == [('alarms handed on', '0'), ('alarms not handed on', f'3 {failure}')]
 
 
 def test_a_command_that_hangs_is_killed_with_what_it_started(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -148,9 +144,7 @@ def test_webhook_is_tried_three_times_for_each_alarm(server: Server) -> None:
     out, stated = forwarded('', server.url, times=2)
     assert len(server.got) == 5
     assert (out.sent, out.failed) == (1, 1)
-    assert stated == [
-        'watch: webhook at 127.0.0.1: answers 429; an alarm was not handed on, and further ones are counted'
-    ]
+    assert stated == [f'watch: webhook at 127.0.0.1: answers 429{NOT_HANDED_ON}']
 
 
 @pytest.mark.parametrize('answer', [302, 404])
@@ -173,7 +167,7 @@ def test_alarms_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'MOST_WAITING', 0)
     out, stated = forwarded('true', times=2)
     assert out.failed == 2
-    assert stated == ['watch: alarms: 0 wait already; an alarm was not handed on, and further ones are counted']
+    assert stated == [f'watch: alarms: 0 wait already{NOT_HANDED_ON}']
 
 
 def test_an_address_that_is_a_secret_stays_in_its_file(server: Server, tmp_path: Path) -> None:
@@ -205,10 +199,10 @@ def test_what_cannot_be_used_is_rejected_at_the_start(command: str, webhook: str
         AlarmOut(command, webhook, texts(lambda text: None))
 
 
-def drifting(path: Path) -> Path:
+def drifting(path: Path, *more: str) -> Path:
     """A recording in which a laser wanders."""
     effect = 'laser_pointing_drift,psd=1,rate_x=3e-7'
-    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:20', '--effect', effect]) == 0
+    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:20', '--effect', effect, *more]) == 0
     return path
 
 
@@ -231,9 +225,7 @@ def test_no_recording_makes_a_replay_run_anything(tmp_path: Path, capsys: pytest
     made = tmp_path / 'made'
     rig = f'/**:\n  ros__parameters:\n    watch: "on"\n    watch_command: touch {made}\n'
     (tmp_path / 'rig.yaml').write_text(rig)
-    argv = ['simulate', '--out', str(tmp_path / 'rec'), '--loads', 'constant:0,0,0:20']
-    argv += ['--effect', 'laser_pointing_drift,psd=1,rate_x=3e-7', '--params-file', str(tmp_path / 'rig.yaml')]
-    assert main(argv) == 0
+    drifting(tmp_path / 'rec', '--params-file', str(tmp_path / 'rig.yaml'))
     recorded = rig_at_start(open_recording(tmp_path / 'rec'))
     assert recorded.acquisition.watch_command == f'touch {made}'
     assert main(['replay', str(tmp_path / 'rec'), '--watch']) == 0

@@ -14,8 +14,8 @@ import pytest
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, HelloRequestFrame, PingFrame, encode
 from psd_deflection.rig.config import Rig, load_rig
 from test.heard import WAIT_S
-from test.run import test_acquisition
 from test.run.conftest import HELLO, ScriptedDevice
+from test.run.test_acquisition import Run, numbers, take
 
 
 class ScriptedHost(ScriptedDevice):
@@ -69,8 +69,7 @@ class ScriptedHost(ScriptedDevice):
 def device() -> Iterator[ScriptedHost]:
     scripted = ScriptedHost()
     yield scripted
-    if scripted.plugged:
-        scripted.unplug()
+    scripted.unplug()
 
 
 @pytest.fixture
@@ -79,13 +78,13 @@ def rig(device: ScriptedHost) -> Rig:
 
 
 @pytest.fixture
-def run(device: ScriptedHost, rig: Rig) -> Iterator[test_acquisition.Run]:
-    started = test_acquisition.Run(rig)
+def run(device: ScriptedHost, rig: Rig) -> Iterator[Run]:
+    started = Run(rig)
     yield started
     started.acquisition.stop()
 
 
-def test_the_diagnostics_name_the_port_and_no_line_speed(run: test_acquisition.Run, device: ScriptedHost) -> None:
+def test_the_diagnostics_name_the_port_and_no_line_speed(run: Run, device: ScriptedHost) -> None:
     assert run.acquisition.source.describe()['source'] == f'contract frames on {device.port}'
 
 
@@ -147,8 +146,8 @@ def sender() -> Iterator[Sender]:
 
 
 @pytest.fixture
-def over_udp(sender: Sender) -> Iterator[test_acquisition.Run]:
-    started = test_acquisition.Run(sender.rig)
+def over_udp(sender: Sender) -> Iterator[Run]:
+    started = Run(sender.rig)
     yield started
     started.acquisition.stop()
 
@@ -157,46 +156,42 @@ def frames(sample: Any, *seqs: int) -> bytes:
     return b''.join(encode(sample(s)) for s in seqs)
 
 
-def test_lost_doubled_or_swapped_datagrams_are_counted(
-    sender: Sender, over_udp: test_acquisition.Run, sample: Any
-) -> None:
+def pieces_of(stream: bytes) -> list[bytes]:
+    return [stream[at : at + 50] for at in range(0, len(stream), 50)]
+
+
+def test_lost_doubled_or_swapped_datagrams_are_counted(sender: Sender, over_udp: Run, sample: Any) -> None:
     sent = [frames(sample, *range(n, n + 5)) for n in range(0, 60, 5)]
     # The third is lost, the fifth comes twice, of the seventh and the eighth the second comes first.
     sender.send(*sent[:2], *sent[3:5], sent[4], sent[5], sent[7], sent[6], *sent[8:])
-    got = test_acquisition.numbers(test_acquisition.take(over_udp.acquisition, 50))
+    got = numbers(take(over_udp.acquisition, 50))
     assert got == [*range(10), *range(15, 30), *range(35, 60)]
     counters = over_udp.acquisition.counters
-    assert counters.lost == 10
     assert dict(counters.lost_by) == {'on the wire, without a trace': 10}
-    assert counters.repeated == 10
-    assert counters.bad == 0
+    assert (counters.lost, counters.repeated, counters.bad) == (10, 10, 0)
     assert sender.pinged.wait(WAIT_S)
 
 
-def test_split_frames_are_joined_or_damaged_if_cut(sender: Sender, over_udp: test_acquisition.Run, sample: Any) -> None:
+def test_split_frames_are_joined_or_damaged_if_cut(sender: Sender, over_udp: Run, sample: Any) -> None:
     # HELLO between two pieces would end a frame.
     sender.hush()
-    stream = frames(sample, *range(20))
-    pieces = [stream[at : at + 50] for at in range(0, len(stream), 50)]
-    sender.send(*pieces)
-    assert test_acquisition.numbers(test_acquisition.take(over_udp.acquisition, 20)) == list(range(20))
-    stream = frames(sample, *range(20, 60))
-    pieces = [stream[at : at + 50] for at in range(0, len(stream), 50)]
+    sender.send(*pieces_of(frames(sample, *range(20))))
+    assert numbers(take(over_udp.acquisition, 20)) == list(range(20))
+    pieces = pieces_of(frames(sample, *range(20, 60)))
     sender.send(*pieces[:5], *pieces[6:])
     # The sixth has bytes 250 to 299 of frames of 32.
-    assert test_acquisition.numbers(test_acquisition.take(over_udp.acquisition, 37)) == [*range(20, 27), *range(30, 60)]
+    assert numbers(take(over_udp.acquisition, 37)) == [*range(20, 27), *range(30, 60)]
     counters = over_udp.acquisition.counters
-    assert dict(counters.lost_by) == {'damaged on the wire': 3}
-    assert counters.bad == 1
+    assert (dict(counters.lost_by), counters.bad) == ({'damaged on the wire': 3}, 1)
 
 
 def test_device_at_new_address_introduces_itself(
-    sender: Sender, over_udp: test_acquisition.Run, sample: Any, monkeypatch: pytest.MonkeyPatch
+    sender: Sender, over_udp: Run, sample: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from psd_deflection.devices import udp_port
 
     sender.send(frames(sample, *range(20)))
-    test_acquisition.take(over_udp.acquisition, 20)
+    take(over_udp.acquisition, 20)
     monkeypatch.setattr(udp_port, 'SILENT_S', 0.0)
     sender.start()
     text = over_udp.heard('sends now')
@@ -204,21 +199,19 @@ def test_device_at_new_address_introduces_itself(
     assert text.endswith('waiting for it to come back')
     over_udp.heard('the device is back')
     sender.send(frames(sample, *range(40, 60)))
-    assert test_acquisition.numbers(test_acquisition.take(over_udp.acquisition, 20)) == list(range(40, 60))
+    assert numbers(take(over_udp.acquisition, 20)) == list(range(40, 60))
     assert over_udp.acquisition.counters.lost == 20
 
 
-def test_strangers_are_reported_and_nothing_of_theirs_is_taken(
-    sender: Sender, over_udp: test_acquisition.Run, sample: Any
-) -> None:
-    stranger = Sender(encode(HelloFrame(1, {**test_acquisition.HELLO_INFO, 'serial': 'OTHER'})))
+def test_strangers_are_reported_and_nothing_of_theirs_is_taken(sender: Sender, over_udp: Run, sample: Any) -> None:
+    stranger = Sender(encode(HelloFrame(1, {**HELLO.info, 'serial': 'OTHER'})))
     stranger.place = sender.place
     try:
         text = over_udp.heard('are not taken')
         assert text.startswith(f'{sender.rig.acquisition.port}: datagrams of 127.0.0.1:')
         stranger.send(frames(sample, *range(500, 520)))
         sender.send(frames(sample, *range(20)))
-        assert test_acquisition.numbers(test_acquisition.take(over_udp.acquisition, 20)) == list(range(20))
+        assert numbers(take(over_udp.acquisition, 20)) == list(range(20))
         assert over_udp.acquisition.hello is not None
         assert over_udp.acquisition.hello.info['serial'] == 'T-1'
     finally:
@@ -230,14 +223,13 @@ def test_text_lines_are_never_put_together_of_two_datagrams() -> None:
     about = b'# {"serial": "W-1", "sample_rate_hz": 1000}\n'
     sender = Sender(about)
     rig = load_rig(overrides={'port': sender.rig.acquisition.port, 'source': 'lines'})
-    run = test_acquisition.Run(rig)
+    run = Run(rig)
     try:
         lines = [b'%d,%d,0.1,0.2,5.0,0.3,0.4,5.0' % (n, 1000 * n) for n in range(40)]
         # A line without its end is one all the same.
         sender.send(*lines[:5], lines[5][:12], lines[6][12:], *lines[7:])
-        assert test_acquisition.numbers(test_acquisition.take(run.acquisition, 38)) == [*range(5), *range(7, 40)]
-        assert run.acquisition.counters.lost == 2
-        assert run.acquisition.counters.bad == 2
+        assert numbers(take(run.acquisition, 38)) == [*range(5), *range(7, 40)]
+        assert (run.acquisition.counters.lost, run.acquisition.counters.bad) == (2, 2)
         assert run.acquisition.source.describe()['sender'].startswith('127.0.0.1:')
     finally:
         run.acquisition.stop()

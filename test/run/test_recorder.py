@@ -15,6 +15,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from rosbags.rosbag2 import Reader
@@ -28,13 +29,13 @@ from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
+from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import DeflectionEstimate, ParameterChange, Record, SampleBlock
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run import recorder as module
 from psd_deflection.run import recorder as recorder_module
 from psd_deflection.run import session as session_module
 from psd_deflection.run.diagnostics import WARN, HealthReporter
-from psd_deflection.run.recorder import Recorder
+from psd_deflection.run.recorder import CHECK_EVERY, QUEUED_PER_BLOCK, Recorder
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S, until
 from test.recordings.making import block
@@ -46,11 +47,9 @@ MB = 1_000_000
 class Disk:
     """What ``shutil.disk_usage`` says."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self) -> None:
         self.free = 10_000 * MB
-        self.grows = 0
         self.asked = threading.Semaphore(0)
-        monkeypatch.setattr(shutil, 'disk_usage', self.usage)
 
     def usage(self, path: Path) -> Any:
         self.asked.release()
@@ -59,7 +58,9 @@ class Disk:
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    return Disk(monkeypatch)
+    made = Disk()
+    monkeypatch.setattr(shutil, 'disk_usage', made.usage)
+    return made
 
 
 class Run:
@@ -96,14 +97,13 @@ def rig_for(tmp_path: Path, **changes: object) -> Rig:
 
 def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, disk: Disk) -> None:
     run = Run(rig_for(tmp_path, disk_reserve=200 * MB))
-    run.put(module.CHECK_EVERY)
+    run.put(CHECK_EVERY)
     assert disk.asked.acquire(timeout=WAIT_S)
     disk.free = 150 * MB
-    run.put(2 * module.CHECK_EVERY)
+    run.put(2 * CHECK_EVERY)
     text = run.heard()
     assert 'the disk has 150 MB left, less than disk_reserve = 200 MB; it is complete up to here' in text
-    assert text.count('\n') == 0
-    assert run.recorder.folder is None
+    assert (text.count('\n'), run.recorder.folder) == (0, None)
     assert run.recorder.failure in text
     with Reader(run.folder) as reader:
         assert reader.message_count == run.recorder.written + 1
@@ -125,7 +125,7 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
         shutil.rmtree(run.folder)
     else:
         run.folder.rename(tmp_path / 'elsewhere')
-    run.put(module.CHECK_EVERY)
+    run.put(CHECK_EVERY)
     text = run.heard()
     assert '_0.mcap: was deleted or moved while it was recorded; start another recording' in text
     assert run.recorder.failure in text
@@ -147,7 +147,7 @@ def test_nothing_is_written_through_link_at_folder(tmp_path: Path, noticed: str)
     (target / 'metadata.yaml').write_text('theirs')
     run.folder.symlink_to(target)
     if noticed == 'while it runs':
-        run.put(module.CHECK_EVERY)
+        run.put(CHECK_EVERY)
     else:
         # It is told of no recording that is not there.
         assert run.recorder.close() is None
@@ -158,12 +158,9 @@ def test_nothing_is_written_through_link_at_folder(tmp_path: Path, noticed: str)
 
 
 def test_no_error_ends_a_recording_in_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
-        raise KeyError('no such type')
-
     run = Run(rig_for(tmp_path))
     run.put(3)
-    monkeypatch.setattr('psd_deflection.recordings.write.bag_writer.BagWriter.write_encoded', fails)
+    monkeypatch.setattr(BagWriter, 'write_encoded', Mock(side_effect=KeyError('no such type')))
     run.put(1)
     assert "KeyError: 'no such type'" in run.heard()
     assert run.recorder.folder is None
@@ -192,43 +189,39 @@ def test_the_oldest_file_is_deleted_where_that_was_asked_for(
     mine.write_text('not of this recording')
     rig = rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest', bag_max_duration=1.0)
     run = Run(rig)
-    run.put(module.CHECK_EVERY - 1)
+    run.put(CHECK_EVERY - 1)
     disk.free = 150 * MB
     run.put(1)
     assert 'deleted, the disk has 150 MB left' in run.heard()
     assert run.stop() == run.folder
     assert run.recorder.files_deleted == 1
     assert mine.exists()
-    assert run.indices() == list(range(50, module.CHECK_EVERY))
+    assert run.indices() == list(range(50, CHECK_EVERY))
     with Reader(run.folder) as reader:
-        assert reader.message_count == module.CHECK_EVERY - 50 + len(list(run.folder.glob('*.mcap')))
+        assert reader.message_count == CHECK_EVERY - 50 + len(list(run.folder.glob('*.mcap')))
 
 
 def test_files_older_than_bag_keep_are_deleted(tmp_path: Path) -> None:
     run = Run(rig_for(tmp_path, bag_keep=1.39))
-    run.put(module.CHECK_EVERY)
+    run.put(CHECK_EVERY)
     assert run.heard().endswith('_0.mcap: deleted, it ended more than bag_keep = 1.39 s ago')
     run.stop()
     # Files of ten blocks: a seventh of 1.39 s is just less.
     assert run.recorder.files_deleted == 18
-    assert run.indices() == list(range(180, module.CHECK_EVERY))
+    assert run.indices() == list(range(180, CHECK_EVERY))
     assert open_recording(run.folder).warnings == []
 
 
 def test_with_nothing_to_delete_it_ends(tmp_path: Path, disk: Disk) -> None:
     run = Run(rig_for(tmp_path, disk_reserve=200 * MB, disk_full='delete_oldest'))
     disk.free = 150 * MB
-    run.put(module.CHECK_EVERY)
+    run.put(CHECK_EVERY)
     assert 'no older file of this recording' in run.heard()
 
 
 def test_failing_disk_ends_recording_with_advice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Run(rig_for(tmp_path))
-
-    def reject(fd: int) -> None:
-        raise OSError(errno.EIO, 'Input/output error')
-
-    monkeypatch.setattr(os, 'fsync', reject)
+    monkeypatch.setattr(os, 'fsync', Mock(side_effect=OSError(errno.EIO, 'Input/output error')))
     run.put(60)
     text = run.heard()
     assert 'Input/output error' in text
@@ -246,7 +239,7 @@ def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch
         go_on.wait()
         fsync(fd)
 
-    limit = 2 * module.QUEUED_PER_BLOCK
+    limit = 2 * QUEUED_PER_BLOCK
     run = Run(rig_for(tmp_path), queue_blocks=2)
     monkeypatch.setattr(os, 'fsync', slow)
     run.put(1)
@@ -336,8 +329,8 @@ class HangingDisk:
         self.go_on.clear()
         self.hangs_at = what
 
-    def is_reached(self) -> bool:
-        return self.reached.wait(WAIT_S)
+    def await_reached(self) -> None:
+        assert self.reached.wait(WAIT_S)
 
 
 class Live:
@@ -410,7 +403,7 @@ def blocks_of(folder: Path) -> list[int]:
 def test_estimates_flow_while_disk_hangs_at_start(live: Live, hanging_disk: HangingDisk, where: str) -> None:
     hanging_disk.hang(where)
     first = live.session.record(True)
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     live.flow()
     second = live.session.record(True)
     assert not first.done()
@@ -439,7 +432,7 @@ def test_estimates_flow_while_the_disk_hangs_in_a_recording(live: Live, hanging_
     folder = live.record(True)
     hanging_disk.hang(where)
     live.flow()
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     live.flow()
     ended = live.session.record(False)
     live.flow()
@@ -456,7 +449,7 @@ def test_estimates_flow_while_disk_hangs_at_end(live: Live, hanging_disk: Hangin
     live.flow()
     hanging_disk.hang('close')
     ended = live.session.record(False)
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     live.flow()
     second = live.record(True)
     assert second != first
@@ -472,12 +465,9 @@ def test_estimates_flow_while_disk_hangs_at_end(live: Live, hanging_disk: Hangin
 def test_stop_reports_a_recording_that_cannot_be_closed(
     live: Live, hanging_disk: HangingDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def reject(fd: int) -> None:
-        raise OSError(5, 'Input/output error')
-
     live.record(True)
     live.flow()
-    monkeypatch.setattr(os, 'fsync', reject)
+    monkeypatch.setattr(os, 'fsync', Mock(side_effect=OSError(errno.EIO, 'Input/output error')))
     with pytest.raises(RecordingError, match=r'Input/output error.*psd-deflection recover'):
         live.session.record(False).result(WAIT_S)
 
@@ -485,15 +475,12 @@ def test_stop_reports_a_recording_that_cannot_be_closed(
 def test_self_ended_recording_is_not_taken_for_running(
     live: Live, hanging_disk: HangingDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def gone(*_: object) -> None:
-        raise KeyError('no such type')
-
     first = live.record(True)
     hanging_disk.hang('close')
     with monkeypatch.context() as broken:
-        broken.setattr('psd_deflection.recordings.write.bag_writer.BagWriter.write_encoded', gone)
+        broken.setattr(BagWriter, 'write_encoded', Mock(side_effect=KeyError('no such type')))
         live.flow()
-        assert hanging_disk.is_reached()
+        hanging_disk.await_reached()
     assert live.session.recorder.folder is None
     second = live.record(True)
     assert second != first
@@ -506,7 +493,7 @@ def test_self_ended_recording_is_not_taken_for_running(
 def test_a_start_that_hangs_can_be_ended(live: Live, hanging_disk: HangingDisk, tmp_path: Path) -> None:
     hanging_disk.hang('fsync')
     started = live.session.record(True)
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     assert live.session.record(False).result(WAIT_S) is None
     with pytest.raises(RecordingError, match='ended before the disk answered; nothing was recorded'):
         started.result(WAIT_S)
@@ -522,7 +509,7 @@ def test_a_start_that_hangs_can_be_ended(live: Live, hanging_disk: HangingDisk, 
 def test_a_start_that_hangs_does_not_hold_up_the_end_of_the_run(live: Live, hanging_disk: HangingDisk) -> None:
     hanging_disk.hang('fsync')
     started = live.session.record(True)
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     live.session.close()
     with pytest.raises(RecordingError, match='nothing was recorded'):
         started.result(WAIT_S)
@@ -561,39 +548,38 @@ def test_recording_holds_up_the_end_for_limited_time(
     assert not hanging_disk.go_on.is_set()
 
 
-def test_a_disk_that_hangs_does_not_hold_up_the_start_of_a_run(
+@pytest.fixture
+def stalled(
     hanging_disk: HangingDisk, device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+) -> Live:
+    """A run that has begun with a recording for which the disk hangs."""
     monkeypatch.setattr(session_module, 'OPEN_S', 0.01)
     one = Live(device, sample, tmp_path / 'bags', record=True)
     hanging_disk.hang('open')
     one.session.start()
-    one.heard('the disk does not answer; the recording begins when it does')
-    one.flow()
+    return one
+
+
+def test_a_disk_that_hangs_does_not_hold_up_the_start_of_a_run(hanging_disk: HangingDisk, stalled: Live) -> None:
+    stalled.heard('the disk does not answer; the recording begins when it does')
+    stalled.flow()
     hanging_disk.go_on.set()
-    one.heard('recording to')
-    one.flow()
-    folder = one.session.close()
+    stalled.heard('recording to')
+    stalled.flow()
+    folder = stalled.session.close()
     assert folder is not None
     assert blocks_of(folder) == list(range(BLOCKS, 2 * BLOCKS))
 
 
-def test_a_late_disk_error_is_reported(
-    hanging_disk: HangingDisk, device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(session_module, 'OPEN_S', 0.01)
-    (tmp_path / 'bags').mkdir()
-    one = Live(device, sample, tmp_path / 'bags', record=True)
-    hanging_disk.hang('open')
-    one.session.start()
-    assert hanging_disk.is_reached()
+def test_a_late_disk_error_is_reported(hanging_disk: HangingDisk, stalled: Live, tmp_path: Path) -> None:
+    hanging_disk.await_reached()
     (folder,) = (tmp_path / 'bags').iterdir()
     folder.rmdir()
     hanging_disk.go_on.set()
-    assert 'No such file' in one.heard('not recorded: ')
-    assert 'No such file' in one.session.recorder.failure
-    one.flow()
-    one.session.close()
+    assert 'No such file' in stalled.heard('not recorded: ')
+    assert 'No such file' in stalled.session.recorder.failure
+    stalled.flow()
+    stalled.session.close()
 
 
 def test_a_disk_that_rejects_at_once_ends_the_start(device: ScriptedDevice, sample: Sample, tmp_path: Path) -> None:
@@ -606,11 +592,8 @@ def test_a_disk_that_rejects_at_once_ends_the_start(device: ScriptedDevice, samp
 
 
 def test_recording_without_pipeline_leaves_nothing(tmp_path: Path) -> None:
-    def busy(action: Callable[[], None]) -> None:
-        raise TimeoutError('no data flows')
-
     rig = load_rig(overrides={'bag_dir': str(tmp_path / 'bags')})
-    recorder = Recorder(10, texts(print), busy)
+    recorder = Recorder(10, texts(print), Mock(side_effect=TimeoutError('no data flows')))
     started: Future[Path | None] = recorder.start(rig, None, lambda _: None)
     with pytest.raises(TimeoutError, match='no data flows'):
         started.result(WAIT_S)
@@ -623,7 +606,7 @@ def test_recording_without_pipeline_leaves_nothing(tmp_path: Path) -> None:
 def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, hanging_disk: HangingDisk, tmp_path: Path) -> None:
     hanging_disk.hang('fsync')
     assert live.session.zero() is not None
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     live.flow()
     live.session.change({'psd_1.zero': (3e-4, 0.0)})
     live.session.change({'psd_1.zero': (1e-4, -2e-4)})
@@ -646,7 +629,7 @@ def test_zero_holds_up_the_end_for_limited_time(
     monkeypatch.setattr(session_module, 'KEEP_S', 0.01)
     hanging_disk.hang('fsync')
     assert live.session.zero() is not None
-    assert hanging_disk.is_reached()
+    hanging_disk.await_reached()
     live.session.close()
     assert live.heard('the zero may not be kept').startswith(str(tmp_path / 'zero.json'))
     assert not hanging_disk.go_on.is_set()

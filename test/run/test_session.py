@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
@@ -39,10 +40,8 @@ class Running:
 
     def __init__(self, device: ScriptedDevice, sample: Sample, folder: Path) -> None:
         self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
-        rig = load_rig(
-            overrides={'port': str(device.link), 'keep_zero': False, 'link.length': 0.5, 'bag_dir': str(folder)}
-        )
-        self.session = Session(rig, texts(self.logged.put))
+        values = {'port': str(device.link), 'keep_zero': False, 'link.length': 0.5, 'bag_dir': str(folder)}
+        self.session = Session(load_rig(overrides=values), texts(self.logged.put))
         estimates = Estimates(5)
         self.session.processing.sinks.append(estimates)
         self.session.start()
@@ -67,6 +66,13 @@ def running(
     one = Running(device, sample, tmp_path / 'recordings')
     yield one
     one.session.close()
+
+
+def observed_session(running: Running) -> tuple[Session, Estimates]:
+    """Its session, and what comes to it as an input."""
+    observed = Estimates()
+    running.session.input_sinks.append(observed)
+    return running.session, observed
 
 
 def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: ScriptedDevice) -> None:
@@ -102,12 +108,8 @@ def test_a_zero_that_was_taken_under_a_load_is_reported(running: Running) -> Non
 def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> None:
     running.session.reject_input(LOAD, 'a number is not finite')
     running.session.processing.request(lambda: None)
-    families = ShownSession(running.session).metrics()
-    found = {
-        (s.name, *s.labels.values()): s.value
-        for family in text_string_to_metric_families(text_of(families))
-        for s in family.samples
-    }
+    families = text_string_to_metric_families(text_of(ShownSession(running.session).metrics()))
+    found = {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
     assert found[('psd_deflection_samples_total',)] == running.session.acquisition.counters.samples > 0
     assert found[('psd_deflection_estimates_total',)] >= 5.0
     assert found[('psd_deflection_messages_rejected_total', LOAD)] == 1.0
@@ -128,12 +130,9 @@ def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, d
     assert description_of_dots() == [(STALE, 'no samples')] * 2
 
 
-def test_a_step_of_the_system_clock_moves_no_stamp_of_the_run(
-    running: Running, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    acquisition = running.session.acquisition
+def test_a_step_of_the_system_clock_moves_no_stamp(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition, real = running.session.acquisition, time.time_ns
     before = acquisition.now_ns()
-    real = time.time_ns
     monkeypatch.setattr(time, 'time_ns', lambda: real() - 3600 * 10**9)
     assert before <= acquisition.now_ns() < before + 600 * 10**9
     assert acquisition.system_clock_step_ns() == pytest.approx(-3600e9, abs=1e9)
@@ -146,8 +145,7 @@ def test_zero_of_long_silent_device_is_rejected(running: Running, monkeypatch: p
 
 
 def test_annotated_load_holds_for_the_next_recording(running: Running, device: ScriptedDevice, sample: Sample) -> None:
-    session, observed = running.session, Estimates()
-    session.input_sinks.append(observed)
+    session, observed = observed_session(running)
     first = session.note_load(0.0, -10.0, 0.5)
     running.heard('load noted: Fx 0 N, Fy -10 N, Tz 0.5 N·m')
     before = session.acquisition.now_ns()
@@ -172,9 +170,8 @@ def test_past_load_is_stamped_with_its_own_time(running: Running, device: Script
     first = session.note_load(0.0, -10.0, 0.0, ago_s=5.0)
     running.heard('Fy -10 N, Tz 0 N·m, since 5.00 s ago')
     assert 0 <= first.t_ns - (asked_ns - 5_000_000_000) < session.acquisition.now_ns() - asked_ns + 1
-    with pytest.raises(
-        ValueError, match=r'the present load began 5\.\d\d s ago, so this one cannot have begun 9\.00 s'
-    ):
+    words = r'the present load began 5\.\d\d s ago, so this one cannot have begun 9\.00 s'
+    with pytest.raises(ValueError, match=words):
         session.note_load(0.0, -20.0, 0.0, ago_s=9.0)
     assert session.load == first
     # From the page, as far as the daemon knows when the dots moved.
@@ -193,10 +190,8 @@ def test_past_load_is_stamped_with_its_own_time(running: Running, device: Script
 
 
 def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -> None:
-    session = running.session
+    session, observed = observed_session(running)
     shown = ShownSession(session)
-    observed = Estimates()
-    session.input_sinks.append(observed)
     before = session.acquisition.now_ns()
     shown.mark('bumped it', 8.0)
     shown.load(0.0, -10.0, 0.0, False, 0.0, 6.0)
@@ -213,8 +208,7 @@ def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -
 
 
 def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:
-    session, observed = running.session, Estimates()
-    session.input_sinks.append(observed)
+    session, observed = observed_session(running)
     folder = session.record(True).result(WAIT_S)
     assert folder is not None
     device.send_frames(*(sample(seq) for seq in range(200, 300)))
@@ -228,8 +222,7 @@ def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDe
 
 
 def test_invalid_or_frequent_mark_is_rejected(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    session, observed = running.session, Estimates()
-    session.input_sinks.append(observed)
+    session, observed = observed_session(running)
     for text in ('', 'x' * 201, 'a\x1b[31m', '\ud800'):
         with pytest.raises(ValueError, match='a mark'):
             session.note_mark(text)
@@ -245,25 +238,24 @@ def test_invalid_or_frequent_mark_is_rejected(running: Running, monkeypatch: pyt
 
 
 def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) -> None:
-    observed = Estimates()
-    running.session.input_sinks.append(observed)
+    session, observed = observed_session(running)
 
     def give(pose: ReferencePose) -> Record | None:
         (message,) = to_messages(pose)
-        return running.session.take_input(REFERENCE, cdr.encode(message.type, message.fields))
+        return session.take_input(REFERENCE, cdr.encode(message.type, message.fields))
 
     good = ReferencePose(1_700_000_000_000_000_000, 1e-3, -2e-3, 0.0)
     assert give(good) == good
     assert give(good._replace(dx=float('nan'))) is None
-    assert running.session.take_input(REFERENCE, b'too short') is None
+    assert session.take_input(REFERENCE, b'too short') is None
     # A publisher that sends no stamp means now.
     now = give(good._replace(t_ns=0))
     assert isinstance(now, ReferencePose)
     assert now.t_ns > good.t_ns
     assert observed.records == [good, now]
-    running.session.processing.request(lambda: None)
-    assert running.session.rejected == {REFERENCE: 2}
-    entry = HealthReporter(running.session).report(0).entries[0]
+    session.processing.request(lambda: None)
+    assert session.rejected == {REFERENCE: 2}
+    entry = HealthReporter(session).report(0).entries[0]
     assert dict(entry.values)[f'messages rejected: {REFERENCE}'] == '2'
     assert entry.level == WARN
     assert entry.message.startswith(f'{REFERENCE}: rejected: ')
@@ -304,22 +296,19 @@ def test_two_serial_numbers_never_share_a_zero(rig: Rig, one: str, other: str) -
     assert ZeroStore(rig, one).load(rig)[0].values['psd_1.zero'] == ZERO['psd_1.zero']
 
 
-def test_a_zero_file_of_another_device_is_passed_over(tmp_path: Path) -> None:
-    named = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json')})
-    assert ZeroStore(named, 'A').save(replace_values(named, ZERO)) == ''
-    back, message, level = ZeroStore(named, 'B').load(named)
-    assert back is named
-    assert 'that of another device' in message
-    assert level == WARNING
-
-
-def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
-    ZeroStore(rig, 'A').save(replace_values(rig, ZERO))
-    edited = load_rig(overrides={'psd_1.zero': [5e-4, 0.0]})
-    back, message, level = ZeroStore(edited, 'A').load(edited)
-    assert back is edited
-    assert 'the rig file holds' in message
-    assert level == WARNING
+@pytest.mark.parametrize(
+    ('changed', 'serial', 'words'),
+    [({}, 'B', 'that of another device'), ({'psd_1.zero': [5e-4, 0.0]}, 'A', 'the rig file holds')],
+)
+def test_zero_of_another_device_or_rig_file_is_passed_over(
+    tmp_path: Path, changed: dict[str, object], serial: str, words: str
+) -> None:
+    named = {'zero_file': str(tmp_path / 'zero.json')}
+    rig = load_rig(overrides=named)
+    assert ZeroStore(rig, 'A').save(replace_values(rig, ZERO)) == ''
+    now = load_rig(overrides={**named, **changed})
+    back, message, level = ZeroStore(now, serial).load(now)
+    assert (back is now, words in message, level) == (True, True, WARNING)
 
 
 @pytest.mark.parametrize('serial', ['../../evil', '/etc/passwd', '..', '', None, 'a' * 500, 'x\x00y', 7])
@@ -329,6 +318,14 @@ def test_no_serial_number_leads_out_of_the_folder(rig: Rig, tmp_path: Path, seri
     assert len(store.path.name) < 100
     assert store.save(rig) == ''
     assert store.path.resolve().is_relative_to(tmp_path / 'state')
+
+
+def passed_over(store: ZeroStore, rig: Rig, why: str) -> None:
+    back, message, _ = store.load(rig)
+    assert back is rig
+    assert f'{store.path}: the kept zero cannot be used (' in message
+    assert why in message
+    assert message.endswith('; the rig file holds')
 
 
 @pytest.mark.parametrize(
@@ -346,11 +343,7 @@ def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes, why: str) -> Non
     store = ZeroStore(rig, 'A')
     store.path.parent.mkdir(parents=True)
     store.path.write_bytes(content)
-    back, message, _ = store.load(rig)
-    assert back is rig
-    assert f'{store.path}: the kept zero cannot be used (' in message
-    assert why in message
-    assert message.endswith('; the rig file holds')
+    passed_over(store, rig, why)
 
 
 @pytest.mark.parametrize('zero', [[9, 9], 'x', [float('nan'), 0], [0], None, {}, [0, 0, 0], [True, 0]])
@@ -360,10 +353,7 @@ def test_a_kept_zero_is_checked_like_any_parameter(rig: Rig, zero: object) -> No
     kept = json.loads(store.path.read_text())
     assert store.load(rig)[0] is not rig
     store.path.write_text(json.dumps({**kept, 'psd_1.zero': zero}))
-    back, message, _ = store.load(rig)
-    assert back is rig
-    assert f'{store.path}: the kept zero cannot be used (' in message
-    assert 'psd_1.zero' in message
+    passed_over(store, rig, 'psd_1.zero')
 
 
 def test_a_kept_zero_names_its_device_or_is_reported(tmp_path: Path) -> None:
@@ -372,12 +362,8 @@ def test_a_kept_zero_names_its_device_or_is_reported(tmp_path: Path) -> None:
     assert json.loads((tmp_path / 'zero.json').read_text())['serial'] == 'A'
     rig = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json' / 'zero.json')})
     store = ZeroStore(rig, 'A')
-    logged: list[tuple[str, int]] = []
-
-    def log(text: str, level: int = INFO, /) -> None:
-        logged.append((text, level))
-
+    log = Mock()
     store.keep(rig, log)
     assert store.join(WAIT_S)
-    assert logged == [(store.save(rig), ERROR)]
-    assert 'cannot be kept' in logged[0][0]
+    log.assert_called_once_with(store.save(rig), ERROR)
+    assert 'cannot be kept' in store.save(rig)

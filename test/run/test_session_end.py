@@ -15,6 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -41,6 +42,8 @@ from psd_deflection.run.session import Session
 from test.heard import WAIT_S, until
 
 ALLOWED_S = 2.0
+Sample = Callable[..., SampleFrame]
+Capsys = pytest.CaptureFixture[str]
 
 
 class Hanging:
@@ -118,7 +121,7 @@ def ended_with(session: Session) -> list[BaseException]:
 
 
 def test_samples_without_room_are_reported_and_counted(
-    device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], capsys: pytest.CaptureFixture[str]
+    device: Any, rig: Rig, tmp_path: Path, sample: Sample, capsys: Capsys
 ) -> None:
     logged: list[str] = []
     session, held = run_of(rig, tmp_path, logged, queue_blocks=2)
@@ -131,9 +134,8 @@ def test_samples_without_room_are_reported_and_counted(
     device.send_frames(*(sample(seq) for seq in range(400, 440)))
     until(lambda: session.acquisition.counters.samples == 440 and session.acquisition.queue.empty())
     (line,) = (line for line in logged if 'dropped here' in line)
-    assert re.fullmatch(
-        r'this machine is too slow: \d+ samples dropped here so far \(2 blocks wait, queue_blocks\)', line
-    )
+    so_far = r'this machine is too slow: \d+ samples dropped here so far \(2 blocks wait, queue_blocks\)'
+    assert re.fullmatch(so_far, line)
     # About 340: a starved reader hands over parts of a block, or the last one when there is room again.
     dropped = session.acquisition.counters.queue_dropped
     assert 300 < dropped < 400
@@ -144,10 +146,8 @@ def test_samples_without_room_are_reported_and_counted(
     assert folder is not None
     (failed,) = ended_with(session)
     assert isinstance(failed, SamplesDroppedError)
-    assert str(failed) == (
-        f'{dropped} samples were read and not processed ({dropped} while it ran, 0 at the end): '
-        'this machine is too slow'
-    )
+    why = f'samples were read and not processed ({dropped} while it ran, 0 at the end): this machine is too slow'
+    assert str(failed) == f'{dropped} {why}'
     assert failed.exit_status == 9
     assert 9 in EXIT_STATUSES
     recording = open_recording(folder)
@@ -164,12 +164,7 @@ def test_samples_without_room_are_reported_and_counted(
 
 
 def test_a_disk_that_fills_gives_a_true_sentence_and_status(
-    device: Any,
-    rig: Rig,
-    tmp_path: Path,
-    sample: Callable[..., SampleFrame],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    device: Any, rig: Rig, tmp_path: Path, sample: Sample, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
     full = usage._replace(free=0)
@@ -198,7 +193,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
 
 @pytest.mark.slow
 def test_samples_behind_part_that_hangs_are_counted(
-    device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], monkeypatch: pytest.MonkeyPatch
+    device: Any, rig: Rig, tmp_path: Path, sample: Sample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(realtime, 'HELD_S', 0.0)
     logged: list[str] = []
@@ -208,11 +203,8 @@ def test_samples_behind_part_that_hangs_are_counted(
     device.send_frames(*(sample(seq) for seq in range(20, 100)))
     until(lambda: session.acquisition.counters.samples == 100)
     session.close()
-    assert any(
-        line == 'pipeline is held up in run.processing.give: the last 80 samples were read and not processed'
-        for line in logged
-    ), logged
-    assert 'pipeline is held up in run.processing.give: the last block is not waited for' in logged
+    for lost in ('the last 80 samples were read and not processed', 'the last block is not waited for'):
+        assert f'pipeline is held up in run.processing.give: {lost}' in logged
     assert not any('subscriber' in line or 'the disk' in line for line in logged)
     assert '80 samples were read and not processed (0 while it ran, 80 at the end)' in str(session.failed)
     (folder,) = tmp_path.glob('psd_*')
@@ -222,9 +214,7 @@ def test_samples_behind_part_that_hangs_are_counted(
     assert not session.alive
 
 
-def test_a_run_that_lost_nothing_here_ends_well(
-    device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame]
-) -> None:
+def test_a_run_that_lost_nothing_here_ends_well(device: Any, rig: Rig, tmp_path: Path, sample: Sample) -> None:
     session, held = run_of(rig, tmp_path, [])
     held.go.set()
     device.send_frames(*(sample(seq) for seq in range(100)))
@@ -236,6 +226,16 @@ def test_a_run_that_lost_nothing_here_ends_well(
     assert 'dropped_here' not in (folder / 'metadata.yaml').read_text()
 
 
+def signal_once_greeted(device: Any, number: signal.Signals) -> None:
+    """Send it to this process once somebody has asked the device who it is."""
+
+    def end() -> None:
+        device.greeted.wait(60.0)
+        os.kill(os.getpid(), number)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_waiting_for_a_silent_device(
     device: Any, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
@@ -244,12 +244,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
     monkeypatch.setattr('psd_deflection.run.acquisition.SILENCE_S', 60.0)
     # Under nohup the tests themselves are started with SIGHUP ignored.
     before = signal.signal(number, signal.SIG_DFL)
-
-    def end() -> None:
-        device.greeted.wait(60.0)
-        os.kill(os.getpid(), number)
-
-    threading.Thread(target=end, daemon=True).start()
+    signal_once_greeted(device, number)
     try:
         assert run_headless({'port': str(device.link)}, Display().log, lambda session: None, start_views) == 0
         assert signal.getsignal(number) is signal.SIG_DFL
@@ -271,18 +266,11 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
             shown.append(live_line(session, 0.0))
             device.answer = b''
             device.plug()
-            threading.Thread(target=end, daemon=True).start()
+            signal_once_greeted(device, signal.SIGINT)
 
-    def end() -> None:
-        device.greeted.wait(60.0)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    sent: list[int] = []
-    away: list[bool] = []
-    shown: list[str] = []
+    sent, away, shown = list[int](), list[bool](), list[str]()
     values: dict[str, object] = {'port': str(device.link), 'keep_zero': False, 'realtime': False}
     assert run_headless(values, Display().log, look, start_views) == 0
-    assert away
     assert 'no samples: the device is away' in shown[0]
 
 
@@ -311,12 +299,9 @@ def test_a_hang_up_that_is_to_be_passed_over_is() -> None:
 
 
 def test_display_survives_a_closed_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Gone(io.StringIO):
-        def write(self, text: str) -> int:
-            raise OSError(errno.EIO, 'Input/output error')
-
-    display = Display()
-    monkeypatch.setattr('sys.stderr', Gone())
+    display, gone = Display(), io.StringIO()
+    monkeypatch.setattr(gone, 'write', Mock(side_effect=OSError(errno.EIO, 'Input/output error')))
+    monkeypatch.setattr('sys.stderr', gone)
     display.log('unheard')
     heard = io.StringIO()
     monkeypatch.setattr('sys.stderr', heard)
@@ -387,9 +372,7 @@ def test_a_request_that_was_begun_is_waited_for(items: ItemQueue, monkeypatch: p
 
 
 def test_errors_of_a_request_come_through(items: ItemQueue) -> None:
-    def reject() -> None:
-        raise TimeoutError('its own')
-
+    reject = Mock(side_effect=TimeoutError('its own'))
     processing = Processing(items, Pipeline(load_rig()), texts(print))
     with pytest.raises(TimeoutError, match='its own'):
         processing.request(reject)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,17 +24,13 @@ def own_state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Serving]]:
-    started: list[Serving] = []
-
+def serve(request: pytest.FixtureRequest) -> Callable[..., Serving]:
     def begin(**overrides: object) -> Serving:
         serving = Serving(overrides)
-        started.append(serving)
+        request.addfinalizer(serving.server.close)
         return serving
 
-    yield begin
-    for serving in started:
-        serving.server.close()
+    return begin
 
 
 @pytest.fixture(scope='module')
@@ -42,6 +39,5 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     # Imported here: only these tests need selenium.
     from .browsing import Page
 
-    one = Page(tmp_path_factory.mktemp('profile'))
-    yield one
-    one.close()
+    with contextlib.closing(Page(tmp_path_factory.mktemp('profile'))) as one:
+        yield one

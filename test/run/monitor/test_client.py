@@ -25,6 +25,7 @@ from .serving import START_NS, Serving
 from .test_server import listen
 
 Serve = Callable[..., Serving]
+Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +34,7 @@ def nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, 'DEFAULT_URL', 'http://127.0.0.1:9/')
 
 
-def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: Capsys) -> None:
     serving = serve()
     assert main(['zero']) == 0
     assert main(['record']) == 0
@@ -51,16 +52,11 @@ def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest
     assert serving.shown.zeros == 1
     assert serving.shown.recordings == ['recordings/test', None]
     assert serving.shown.loads[:2] == [(0.0, -10.0, 0.5, False), (-10.0, 0.0, 0.0, True)]
-    assert capsys.readouterr().out.splitlines() == [
-        'unloaded dots taken',
-        'recording',
-        'recording ended',
-        *['load noted'] * 4,
-        'mark: bumped it',
-    ]
+    answers = ['unloaded dots taken', 'recording', 'recording ended', *['load noted'] * 4, 'mark: bumped it']
+    assert capsys.readouterr().out.splitlines() == answers
 
 
-def test_a_rejection_is_an_error_with_its_reason(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rejection_is_an_error_with_its_reason(serve: Serve, capsys: Capsys) -> None:
     serving = serve()
     serving.shown.rejection = 'not zeroed: no data flows'
     assert main(['zero']) == 7
@@ -74,9 +70,7 @@ def test_what_speaks_to_a_daemon_starts_without_scipy(command: str) -> None:
     assert subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=False).returncode == 0
 
 
-def test_zero_waits_for_a_link_that_moves(
-    serve: Serve, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_zero_waits_for_a_link_that_moves(serve: Serve, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve()
     serving.shown.rejection = 'not zeroed: the link moves: y1 varied by 80.0 µm rms'
     assert main(['zero', '--wait', '0']) == 7
@@ -99,16 +93,14 @@ CALIBRATE = ['calibrate', '--live', '--params-file', str(ROOT / 'config' / 'thes
 
 
 @pytest.mark.skipif('calibrate' not in COMMANDS, reason='an optional room')
-def test_calibrate_needs_the_recording_on_this_machine(
-    serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibrate_needs_the_recording_on_this_machine(serve: Serve, tmp_path: Path, capsys: Capsys) -> None:
     serving = serve()
     assert main([*CALIBRATE, str(tmp_path / 'out')]) == 4
     assert 'recordings/test: is not on this machine' in capsys.readouterr().err
     assert serving.shown.recordings == ['recordings/test', None]
 
 
-def test_echo_prints_new_blocks(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_echo_prints_new_blocks(serve: Serve, capsys: Capsys) -> None:
     serving = serve()
     serving.give(0, 3)
     listen(serving.url, lambda m: 'rows' in m)
@@ -145,7 +137,7 @@ def test_echo_prints_new_blocks(serve: Serve, capsys: pytest.CaptureFixture[str]
             assert second.endswith('no estimate: laser lost  lost 2')
 
 
-def test_the_token_of_an_own_daemon_on_the_network_is_found(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_token_of_an_own_daemon_on_the_network_is_found(serve: Serve, capsys: Capsys) -> None:
     serving = serve(monitor_control=True, monitor_address='0.0.0.0')
     assert main(['zero']) == 0
     url = f'http://127.0.0.1:{serving.port}/'
@@ -175,7 +167,7 @@ def test_what_a_killed_daemon_left_is_removed(own_state: Path) -> None:
     assert [p.name for p in own_state.glob('page_*')] == ['page_1_1.json']
 
 
-def test_several_daemons_are_listed(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_daemons_are_listed(serve: Serve, capsys: Capsys) -> None:
     first, second = serve(), serve()
     assert main(['zero']) == 7
     output = capsys.readouterr().err
@@ -187,9 +179,7 @@ def test_several_daemons_are_listed(serve: Serve, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize('command', [['zero'], ['record'], ['load', '0', '0', '0'], ['mark', 'x'], ['echo']])
-def test_without_a_daemon_the_error_says_how_to_start_one(
-    command: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_daemon_the_error_says_how_to_start_one(command: list[str], capsys: Capsys) -> None:
     assert main(command) == 7
     output = capsys.readouterr().err
     assert 'http://127.0.0.1:9/: no daemon answers (' in output
@@ -198,7 +188,7 @@ def test_without_a_daemon_the_error_says_how_to_start_one(
 
 
 @pytest.mark.parametrize('text', ['-1,5', '1_0', 'ten'])
-def test_a_load_that_is_no_number_says_so(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_load_that_is_no_number_says_so(text: str, capsys: Capsys) -> None:
     assert main(['load', '0', text, '0']) == 2
     output = capsys.readouterr().err
     assert f'FY {text}: must be a number' in output
@@ -230,7 +220,7 @@ def stranger() -> Iterator[str]:
     server.server_close()
 
 
-def test_another_server_is_no_daemon(stranger: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_server_is_no_daemon(stranger: str, capsys: Capsys) -> None:
     assert main(['zero', '--url', stranger]) == 7
     output = capsys.readouterr().err
     assert 'is no answer of a daemon' in output

@@ -87,9 +87,8 @@ class Viewer:
             for channel in logged['channels']:
                 assert (channel['encoding'], channel['schemaEncoding']) == ('cdr', 'ros2msg')
                 self._topics[channel['id']] = channel['topic']
-                self.offered[channel['topic']] = Schema(
-                    id=1, name=channel['schemaName'], encoding='ros2msg', data=channel['schema'].encode()
-                )
+                name, text = channel['schemaName'], channel['schema'].encode()
+                self.offered[channel['topic']] = Schema(id=1, name=name, encoding='ros2msg', data=text)
                 asked = [{'id': channel['id'], 'channelId': channel['id']}]
                 await ws.send_json({'op': 'subscribe', 'subscriptions': asked})
 
@@ -126,10 +125,9 @@ def test_a_recording_is_played_bit_for_bit(start: Callable[..., Program]) -> Non
 def test_a_port_in_use_gives_way_to_a_free_one() -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
-        server = FoxgloveServer(load_rig(overrides={'foxglove_port': port}))
-        assert server.address.startswith('ws://127.0.0.1:')
-        assert not server.address.endswith(f':{port}')
-        server.close()
+        with contextlib.closing(FoxgloveServer(load_rig(overrides={'foxglove_port': port}))) as server:
+            assert server.address.startswith('ws://127.0.0.1:')
+            assert not server.address.endswith(f':{port}')
 
 
 def test_an_address_that_is_not_ours_is_named() -> None:
@@ -170,6 +168,20 @@ async def connected(client: aiohttp.ClientSession, url: str, **headers: str) -> 
     return await client.ws_connect(url, protocols=PROTOCOLS, headers=headers)
 
 
+def status_of(url: str, **headers: str) -> int:
+    """With which a viewer is answered; 101 if it may look."""
+
+    async def go() -> int:
+        async with aiohttp.ClientSession() as client:
+            try:
+                await connected(client, url, **headers)
+            except aiohttp.WSServerHandshakeError as rejected:
+                return rejected.status
+        return 101
+
+    return asyncio.run(asyncio.wait_for(go(), WAIT_S))
+
+
 @pytest.mark.parametrize(
     'headers',
     [
@@ -182,16 +194,8 @@ async def connected(client: aiohttp.ClientSession, url: str, **headers: str) -> 
     ],
 )
 def test_another_site_cannot_look(served: Served, headers: dict[str, str]) -> None:
-    async def go() -> int:
-        given = {name: value.format(port=served.port) for name, value in headers.items()}
-        async with aiohttp.ClientSession() as client:
-            try:
-                await connected(client, served.server.address, **given)
-            except aiohttp.WSServerHandshakeError as rejected:
-                return rejected.status
-        return 101
-
-    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 403
+    given = {name: value.format(port=served.port) for name, value in headers.items()}
+    assert status_of(served.server.address, **given) == 403
     assert not served.logged
 
 
@@ -207,21 +211,9 @@ def test_foxglove_itself_can_look(served: Served, origin: str) -> None:
 
 def test_which_pages_may_look_is_a_parameter() -> None:
     rig = load_rig(overrides={'foxglove_port': 0, 'foxglove_origins': ['https://viewer.example']})
-    server = FoxgloveServer(rig)
-
-    async def go(origin: str) -> int:
-        async with aiohttp.ClientSession() as client:
-            try:
-                await connected(client, server.address, Origin=origin)
-            except aiohttp.WSServerHandshakeError as rejected:
-                return rejected.status
-        return 101
-
-    try:
-        assert asyncio.run(go('https://viewer.example')) == 101
-        assert asyncio.run(go('https://app.foxglove.dev')) == 403
-    finally:
-        server.close()
+    with contextlib.closing(FoxgloveServer(rig)) as server:
+        assert status_of(server.address, Origin='https://viewer.example') == 101
+        assert status_of(server.address, Origin='https://app.foxglove.dev') == 403
 
 
 def deaf(served: Served) -> socket.socket:

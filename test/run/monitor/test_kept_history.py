@@ -6,8 +6,9 @@ import contextlib
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from psd_deflection.base.log import texts
 from psd_deflection.records import Mark
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import kept_history
-from psd_deflection.run.monitor.history import LEVELS, Asked, History, Kept
+from psd_deflection.run.monitor.history import LEVELS, Asked, History
 from psd_deflection.run.monitor.kept_history import HistoryFile, HistoryKeeper
 from psd_deflection.run.state import device_file
 from test.heard import until
@@ -30,23 +31,19 @@ from .test_server import column, history_of
 IN_MEMORY = Path(':memory:')
 LATER = START_NS + 10**9 * SECOND
 Serve = Callable[..., Serving]
-
-
 Open = Callable[..., HistoryFile]
 
 
 @pytest.fixture
-def file_of() -> Iterator[Open]:
+def file_of(request: pytest.FixtureRequest) -> Open:
     """Opens the file of a history; closed at the end."""
-    made: list[HistoryFile] = []
 
     def opened(history: History, path: Path = IN_MEMORY) -> HistoryFile:
-        made.append(HistoryFile(path, history.kind, history.names, history.kept_length))
-        return made[-1]
+        file = HistoryFile(path, history.kind, history.names, history.kept_length)
+        request.addfinalizer(file.close)
+        return file
 
-    yield opened
-    for file in made:
-        file.close()
+    return opened
 
 
 def cells(history: History, since: int, points: int = 2000, span: int = 2000) -> dict[str, np.ndarray]:
@@ -170,20 +167,20 @@ class Keeping:
         return len(self.history.rings[1].between(0, LATER))
 
 
+Keep = Callable[[], Keeping]
+
+
 @pytest.fixture
-def keep(tmp_path: Path) -> Iterator[Callable[[], Keeping]]:
-    made: list[Keeping] = []
-
+def keep(tmp_path: Path, request: pytest.FixtureRequest) -> Keep:
     def begin() -> Keeping:
-        made.append(Keeping(tmp_path / 'state' / 'history.sqlite'))
-        return made[-1]
+        one = Keeping(tmp_path / 'state' / 'history.sqlite')
+        request.addfinalizer(one.keeper.end)
+        return one
 
-    yield begin
-    for one in made:
-        one.keeper.end()
+    return begin
 
 
-def test_nothing_is_saved_before_what_was_kept_is_read(keep: Callable[[], Keeping]) -> None:
+def test_nothing_is_saved_before_what_was_kept_is_read(keep: Keep) -> None:
     one = keep()
     one.history.add(row(START_NS, 0.0))
     one.keeper.save()
@@ -197,15 +194,13 @@ def test_nothing_is_saved_before_what_was_kept_is_read(keep: Callable[[], Keepin
     assert one.logged == two.logged == []
 
 
-def test_a_damaged_file_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path) -> None:
+def test_a_damaged_file_is_put_aside(keep: Keep, tmp_path: Path) -> None:
     (tmp_path / 'state').mkdir()
     (tmp_path / 'state' / 'history.sqlite').write_bytes(b'no database at all' * 100)
     one = keep()
     one.restored()
-    assert one.logged == [
-        f'{tmp_path}/state/history.sqlite: the kept history cannot be read (file is not a database); '
-        'it is history.sqlite.damaged now'
-    ]
+    why = 'the kept history cannot be read (file is not a database); it is history.sqlite.damaged now'
+    assert one.logged == [f'{tmp_path}/state/history.sqlite: {why}']
     assert (tmp_path / 'state' / 'history.sqlite.damaged').read_bytes()[:18] == b'no database at all'
     one.history.add(row(START_NS, 0.0))
     one.keeper.end()
@@ -214,7 +209,7 @@ def test_a_damaged_file_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path
     assert two.count() == 1
 
 
-def test_a_file_that_is_damaged_inside_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path) -> None:
+def test_a_file_that_is_damaged_inside_is_put_aside(keep: Keep, tmp_path: Path) -> None:
     one = keep()
     one.restored()
     for k in range(500):
@@ -231,7 +226,7 @@ def test_a_file_that_is_damaged_inside_is_put_aside(keep: Callable[[], Keeping],
     assert path.with_name('history.sqlite.damaged').read_bytes() == content
 
 
-def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Callable[[], Keeping], tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Keep, tmp_path: Path) -> None:
     (tmp_path / 'state').write_text('a file')
     one = keep()
     until(lambda: bool(one.logged))
@@ -242,16 +237,11 @@ def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Callable[
     assert logged.startswith(f'{tmp_path}/state/history.sqlite: the history of the page cannot be kept (')
 
 
-def test_what_the_disk_rejected_is_written_the_next_time(
-    keep: Callable[[], Keeping], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_disk_rejected_is_written_the_next_time(keep: Keep, monkeypatch: pytest.MonkeyPatch) -> None:
     one = keep()
     one.restored()
-
-    def full(self: HistoryFile, kept: Kept) -> None:
-        raise sqlite3.OperationalError('database or disk is full')
-
     with monkeypatch.context() as patched:
+        full = Mock(side_effect=sqlite3.OperationalError('database or disk is full'))
         patched.setattr(HistoryFile, 'save', full)
         for k in range(3):
             one.history.add(row(START_NS + k * 10 * SECOND, 0.0))
@@ -265,7 +255,7 @@ def test_what_the_disk_rejected_is_written_the_next_time(
     assert two.count() == 4
 
 
-def test_a_disk_that_hangs_holds_nobody(keep: Callable[[], Keeping], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_hangs_holds_nobody(keep: Keep, monkeypatch: pytest.MonkeyPatch) -> None:
     one = keep()
     one.restored()
     gate = threading.Event()

@@ -11,6 +11,7 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import urlencode
 
 import aiohttp
@@ -61,10 +62,8 @@ def listen(url: str, until: Callable[[dict[str, Any]], bool], headers: dict[str,
 
     async def go() -> list[Any]:
         got: list[Any] = []
-        async with (
-            aiohttp.ClientSession() as session,
-            session.ws_connect(url + 'ws', headers=headers, max_msg_size=0) as socket,
-        ):
+        connect = aiohttp.ClientSession.ws_connect
+        async with aiohttp.ClientSession() as one, connect(one, url + 'ws', headers=headers, max_msg_size=0) as socket:
             async for message in socket:
                 got.append(json.loads(message.data))
                 if until(got[-1]):
@@ -147,9 +146,7 @@ def test_buttons_are_off_on_network_and_when_disabled(serve: Serve, overrides: d
         assert status == 403
         assert 'monitor_control' in text
         assert reason in text
-    assert serving.shown.zeros == 0
-    assert not serving.shown.recordings
-    assert not serving.shown.loads
+    assert (serving.shown.zeros, serving.shown.recordings, serving.shown.loads) == (0, [], [])
     hello = listen(url, lambda m: 'hello' in m)[0]['hello']
     assert hello['control'] is False
     assert reason in hello['why_no_control']
@@ -180,10 +177,8 @@ def test_requests_from_another_site_are_rejected(
     serving = serve(monitor_control=True)
     for path in ('api/zero', 'api/record', 'api/load', 'api/mark', 'api/play'):
         assert ask(serving.url + path, body=body, headers=headers)[0] == status
-    assert serving.shown.zeros == 0
-    assert not serving.shown.recordings
-    assert not serving.shown.loads
-    assert not serving.shown.marks
+    shown = serving.shown
+    assert (shown.zeros, shown.recordings, shown.loads, shown.marks) == (0, [], [], [])
 
 
 def test_a_moment_is_marked(serve: Serve) -> None:
@@ -246,8 +241,7 @@ def test_a_body_of_another_kind_is_rejected(serve: Serve, path: str, body: objec
         ({'ago': 601}, 'not noted: a load has hung for 0 to 600 s when it is noted'),
     ],
 )
-def test_a_load_out_of_bounds_is_rejected_in_a_person_s_words(serve: Serve, body: object, words: str) -> None:
-    assert isinstance(body, dict)
+def test_a_load_out_of_bounds_is_rejected_in_a_person_s_words(serve: Serve, body: dict[str, float], words: str) -> None:
     serving = serve()
     status, text, _ = ask(f'{serving.url}api/load', body={'fx': 0, 'fy': 0, 'tz': 0, **body})
     assert (status, json.loads(text)['message']) == (400, words)
@@ -268,9 +262,8 @@ def test_loads_zeros_and_references_are_shown(serve: Serve) -> None:
     marks = [mark for m in messages for mark in m.get('marks', ())]
     assert marks == [[t, 'load', 0, -10, 0.5], [pytest.approx(t + 0.02, abs=1e-6), 'zero']]
     references = [r for m in messages for r in m.get('references', ())]
-    assert references == [
-        [pytest.approx(t + 0.02 * k, abs=1e-6), 0.001, -0.002, pytest.approx(0.1 * k)] for k in range(4)
-    ]
+    wanted = [[pytest.approx(t + 0.02 * k, abs=1e-6), 0.001, -0.002, pytest.approx(0.1 * k)] for k in range(4)]
+    assert references == wanted
 
 
 def history_of(serving: Serving, seconds: float, **more: object) -> dict[str, Any]:
@@ -297,7 +290,7 @@ def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> No
     # A number that no sample had, as the device began anew.
     serving.feed.put(ParameterChange(START_NS, 108, ((RESTART, (2160.0, 3000.0)),)))
     serving.give(150, 50)
-    listen(serving.url, lambda m: any(r[1] == 199 for r in m.get('rows', [])))
+    shown(serving, 199)
     serving.shown.alarmed = Alarm(START_NS + 2 * BLOCK_NS, START_NS + 4 * BLOCK_NS, 'x1', 3e-6, 1e-7)
     listen(serving.url, lambda m: any(mark[1] == 'alarm' for mark in m.get('marks', ())))
     answer = history_of(serving, 4.0)
@@ -336,7 +329,6 @@ def test_another_site_cannot_listen(serve: Serve, headers: dict[str, str]) -> No
     serving = serve()
     with pytest.raises(aiohttp.WSServerHandshakeError, match='403'):
         listen(serving.url, lambda m: True, headers)
-    assert ask(serving.url, 'GET', headers={'Host': 'evil.example'})[0] == 403
 
 
 @pytest.mark.parametrize(
@@ -495,8 +487,7 @@ def test_a_request_must_come_from_our_own_page_or_from_none(headers: dict[str, s
 
 
 def test_only_loopback_is_loopback() -> None:
-    assert all(map(is_loopback, ('127.0.0.1', '127.1.2.3', '::1', 'localhost')))
-    assert is_loopback('127.0.0.1%x') is True
+    assert all(map(is_loopback, ('127.0.0.1', '127.1.2.3', '::1', 'localhost', '127.0.0.1%x')))
     assert not any(map(is_loopback, ('0.0.0.0', '::', '192.0.2.1', 'rig', '')))
 
 
@@ -505,17 +496,14 @@ def test_a_token_is_right_or_wrong() -> None:
     assert not any(is_token(given, 'abc') for given in (None, '', 'ab', 'abcd', 'ähc', 'ab\udce9'))
 
 
-@pytest.mark.parametrize('version', ['3.9.0', '3.14.5', '4.0.0a1', '10.0'])
-def test_a_library_that_is_new_enough_is_taken(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
-    monkeypatch.setattr('importlib.metadata.version', lambda _: version)
-    need_server()
-
-
-@pytest.mark.parametrize('version', ['3.8.4', '2.99.0'])
-def test_outdated_library_is_rejected_by_version(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
-    monkeypatch.setattr('importlib.metadata.version', lambda _: version)
-    with pytest.raises(ConfigError, match=rf'needs aiohttp 3\.9 or later, {version} is installed'):
+def test_outdated_library_is_rejected_by_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    for version in ('3.9.0', '3.14.5', '4.0.0a1', '10.0'):
+        monkeypatch.setattr('importlib.metadata.version', Mock(return_value=version))
         need_server()
+    for version in ('3.8.4', '2.99.0'):
+        monkeypatch.setattr('importlib.metadata.version', Mock(return_value=version))
+        with pytest.raises(ConfigError, match=rf'needs aiohttp 3\.9 or later, {version} is installed'):
+            need_server()
 
 
 def numbers(text: str) -> dict[tuple[str, ...], float]:
@@ -647,6 +635,5 @@ def test_why_it_could_not_is_reported(serve: Serve, tmp_path: Path) -> None:
 def test_a_played_recording_and_nonsense_are_rejected(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve()
     assert asked(serving.url, 1) == (400, 'rejected: expected {"calibrate": true} or {"calibrate": false}')
-    described = {'kind': 'replay', 'name': 'test', 'recording': None}
-    monkeypatch.setattr(serving.shown, 'describe', lambda: described)
+    monkeypatch.setattr(serving.shown, 'describe', lambda: {'kind': 'replay', 'name': 'test', 'recording': None})
     assert asked(serving.url, True) == (409, 'a recording is played; psd-deflection calibrate takes it')
