@@ -162,8 +162,7 @@ class BlockEstimator:
 
     ``full``: all PSDs. ``contradictions``: inconsistent blocks. ``misfits``: blocks with motion that the fit cannot
     follow. ``chi_square``: of the last check, of ``freedom`` degrees. ``excluded``: PSDs (from 1) without which the
-    last block was solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near 87 Hz"; '' if
-    nothing is. ``on_plate``: whether the PSDs are on the plate: then the noise is measured, and the readings checked.
+    last block was solved. ``vibrating``: the tones that the last block could not follow. ``on_plate``: whether the PSDs are on the plate: then the noise is measured, and the readings checked.
     """
 
     part = 'the fit and the noise of the dots'
@@ -191,6 +190,7 @@ class BlockEstimator:
         self.contradictions = 0
         self.chi_square = 0.0
         self.misfits = 0
+        self.vibrating: tuple[Tone, ...] = ()
         self._use_noise()
 
     def _model(self) -> tuple[FloatArray | None, Residual | None]:
@@ -225,6 +225,8 @@ class BlockEstimator:
         """
         for run, at in psds.fits(slots, samples):
             self.misfits += run.misfit[at]
+            tones = self.noise.tones
+            self.vibrating = tuple(tones[i] for i in run.vibrating[at])
             yield run, at
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
@@ -270,7 +272,11 @@ class BlockEstimator:
     def _use_noise(self) -> None:
         for psds in (self.full, *self._subsets.values()):
             psds.set_noise(self.noise)
-        self.vibrates = words_of(self.noise.tones, self._rig.converter.sample_rate_hz)
+
+    @property
+    def vibrates(self) -> str:
+        """What the last block could not follow, such as "14 um rms near 87 Hz"; '' if nothing was."""
+        return words_of(self.vibrating, self._rig.converter.sample_rate_hz)
 
     def search_outliers(self, index: int, dots: tuple[float, ...], result: ConsistencyResult) -> None:
         """Take a block into the search for a wrong reading: each inconsistent one, of the others every tenth."""

@@ -282,7 +282,7 @@ class StreamNoise:
         count = self._readings
         if self._search is not None:
             still = np.column_stack((series[:, count:], np.concatenate(sums)))
-            self.tones = self._search.tones(places, moved, still, self._moving)
+            self.tones = self._search.tones(places, moved, still, self._moving, self.tones)
         fixed = _covariance(lags[count:, count:], sure, self._xp)[0, 0]
         self._classify(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()

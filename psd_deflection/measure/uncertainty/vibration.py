@@ -18,6 +18,7 @@ H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings,
 :mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used.
 """
 
+from collections.abc import Sequence
 from math import pi
 from typing import NamedTuple
 
@@ -36,8 +37,14 @@ _OBSERVED = 12.0
 _ELECTRIC = 0.01
 """Share of a tone's variance in what cannot move, from which it is hum and no motion."""
 
-_LOWEST = 0.9
-"""Cycles a block: the polynomials of a block follow what is slower."""
+LOWEST = 0.5
+"""Cycles a block: the polynomials of a block follow what is slower, however weak."""
+
+FOLLOWED = 0.9
+"""Cycles a block: they follow what is slower and strong."""
+
+MATTERS = 0.2
+"""Share of a block's variance, from which it says that it vibrates."""
 
 _GROUP = 50
 """Bins of one floor."""
@@ -60,13 +67,14 @@ class Tone(NamedTuple):
 class ToneSearch:
     """Looks for tones in segments of ``blocks`` blocks of ``size`` samples."""
 
-    def __init__(self, size: int, blocks: int, xp: Arithmetic = FIXED) -> None:
+    def __init__(self, size: int, blocks: int, xp: Arithmetic = FIXED, lowest: float = LOWEST) -> None:
+        """``lowest``: cycles a block from which on tones are looked for."""
         self._xp = xp
         self._length = size * blocks
         angle = np.asarray(2.0 * pi / self._length * np.arange(self._length), np.float64)
         self._window = 0.5 - 0.5 * xp.cos_many(angle)
         self._scale = 2.0 / (self._length * float(xp.sum(self._window * self._window, 0)))
-        self._first = int(_LOWEST * blocks)
+        self._first = int(lowest * blocks)
         # At half the sample rate a tone's other half folds onto it.
         self._last = self._length // 2 - 2
         self._groups = max((self._length // 2 - self._first // 2) // _GROUP, 1)
@@ -78,11 +86,13 @@ class ToneSearch:
         self._right = np.minimum(self._left + 1, self._groups - 1)
         self._share = np.clip((bins - middle[self._left]) / _GROUP, 0.0, 1.0)[:, None]
 
-    def tones(self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray) -> tuple[Tone, ...]:
-        """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its floor first.
+    def tones(
+        self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[Tone] = ()
+    ) -> tuple[Tone, ...]:
+        """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
         ``moving`` (n, a), m: combinations of the readings that move with the link, ``turn`` (a, C) their rows.
-        ``still`` (n, b), m: what cannot move.
+        ``still`` (n, b), m: what cannot move. ``known``: the tones of the segment before: those may be weaker.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
             return ()
@@ -93,18 +103,22 @@ class ToneSearch:
         above = power / self._floor(power)
         free = np.zeros(len(power), dtype=bool)
         free[self._first : self._last + 1] = True
-        peaks = above[:, :count].max(axis=1)
+        limit = np.full(len(power), SIGNIFICANT)
+        for tone in known:
+            at = round(tone.frequency * self._length)
+            limit[max(at - _NARROW, 0) : at + _NARROW + 1] = _OBSERVED
+        peaks = above[:, :count].max(axis=1) / limit
         scale = self._scale * self._xp.square(self._length / len(places))
         out: list[Tone] = []
         for _ in range(_MOST):
             peak = int(np.argmax(np.where(free, peaks, 0.0)))
-            if not free[peak] or peaks[peak] < SIGNIFICANT:
+            if not free[peak] or peaks[peak] < 1.0:
                 break
             wide = max(_NARROW, int(_BROAD * peak))
             band = slice(max(peak - wide, self._first), min(peak + wide, self._last) + 1)
             free[band] = False
             strength = self._xp.sum(power[band], 0)
-            observed = above[band].max(axis=0) > _OBSERVED
+            observed = above[band].max(axis=0) >= _OBSERVED
             moved = strength[:count] * observed[:count]
             if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
                 continue
@@ -112,8 +126,8 @@ class ToneSearch:
             cross = self._xp.times_conjugate(own[:, :, None], own[:, None, :]).real
             covariance = scale * self._xp.sum(np.ascontiguousarray(cross), 0)
             weight = self._xp.sum(power[band, :count] * observed[:count], 1)
-            at = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
-            frequency = float(at) / float(self._xp.sum(weight, 0)) / self._length
+            mean = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
+            frequency = float(mean) / float(self._xp.sum(weight, 0)) / self._length
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
         return tuple(out)
 
