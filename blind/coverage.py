@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -63,8 +64,10 @@ ROWS = (
 UNEQUAL = ROWS[-1]
 SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))
 """What the estimates do not cover in full."""
-TONES = (5.0, 20.0, 45.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
+TONES = (5.0, 14.0, 20.0, 28.0, 36.0, 44.0, 48.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
 SHAKEN = (8e-6, 20e-6, 0.1e-3)  # Its amplitudes: dX, dY m, theta rad, each with a phase of its own.
+SIZES = (0.015, 0.05, 0.15, 1.0)  # Times these.
+LOUDER, EVERY = (0.5, 1.0, 2.0, 4.0), (2, 4, 20)  # Times the noise at rest; s from one change of the load to the next.
 
 
 class Inside(NamedTuple):
@@ -113,13 +116,13 @@ def motion(rest_s: int, steps: int) -> tuple[Array, Array]:
     return optics_of(fine), middles(fine)
 
 
-def _poses(rest_s: int, steps: int) -> Array:
-    n = rest_s * 1000
-    loads = np.zeros((n + steps * 5000, 3))
+def _poses(rest_s: int, steps: int, every_s: int = 5) -> Array:
+    n, dwell = rest_s * 1000, every_s * 1000
+    loads = np.zeros((n + steps * dwell, 3))
     for step in range(0, steps, 2):
         # Off the blocks' grid, each at another place in its block.
-        first = n + step * 5000 + 7 * step % SIZE
-        loads[first : first + 5000] = (0.0, -50.0, -29.25)
+        first = n + step * dwell + 7 * step % SIZE
+        loads[first : first + dwell] = (0.0, -50.0, -29.25)
     return generator.motion(loads, 0.585, [])
 
 
@@ -189,6 +192,20 @@ def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeli
     )
 
 
+def louder(times: float, every_s: int, rest_s: int = 10, seed: int = 1) -> Inside:
+    """The noise becomes so many ``times`` that of ``rest_s`` at rest as the load begins to change ``every_s``: from 10 s
+    after that on."""
+    fine = _poses(rest_s, 40 // every_s, every_s)
+    clean, truth = optics_of(fine), middles(fine)
+    volts = volts_of(ROWS[0], clean, seed)
+    first = rest_s * 1000
+    row = Row('changed', sigmas=tuple(times * s for s in ROWS[0].sigmas))
+    volts[first:] = volts_of(row, clean, seed + 1)[first:]
+    error, covariance, block = _errors(estimates(Pipeline(rig(row)), volts, np.ones(len(volts), bool)), truth)
+    later = block >= (first + 10_000) // SIZE
+    return inside(error[later], covariance[later])
+
+
 def warming(reported: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
     """Readings that drift with temperature by what makers of PSDs state, ``DRIFT``, while it rises by ``RISE``.
     ``reported``: the rig file has the drift, and the temperature is told once a second, to 0.1 K."""
@@ -244,12 +261,14 @@ class Shaken(NamedTuple):
     words: str
 
 
-def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **overrides: object) -> Shaken:
-    """A link without load that vibrates with that frequency and the amplitudes ``SHAKEN``, from the first sample on."""
+def shaken(
+    hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, size: float = 1.0, **overrides: object
+) -> Shaken:
+    """A link without load that vibrates with that frequency and ``size`` times ``SHAKEN``, from the first sample on."""
     n = seconds * int(generator.RATE)
     t = np.arange(n * generator.FINER) / (generator.RATE * generator.FINER)
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 3)
-    fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN
+    fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN * size
     pipeline = Pipeline(rig(row, **overrides))
     volts = volts_of(row, optics_of(fine), seed)
     records = list(pipeline.process(chunk(volts)))
@@ -355,15 +374,15 @@ def one_wrong(rows: int | None) -> int:
 
 VIBRATION_SEEDS = 8
 
-SHAKEN_HEAD = '| Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
+SHAKEN_HEAD = '| µm | Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
 
 
 def vibrations(seeds: int) -> int:
-    """Print a row for each of ``TONES``: the mean of so many runs, each with phases and noise of its own."""
+    """Print a row for each of ``SIZES`` and ``TONES``: the mean of so many runs, with phases and noise of their own."""
     print(SHAKEN_HEAD)
     print('|---' * (SHAKEN_HEAD.count('|') - 1) + '|')
-    for hz in TONES:
-        runs = [shaken(hz, seconds=16, seed=seed) for seed in range(1, seeds + 1)]
+    for times, hz in itertools.product(SIZES, TONES):
+        runs = [shaken(hz, seconds=16, seed=seed, size=times) for seed in range(1, seeds + 1)]
         shares = np.mean([(*r.inside.axes, r.inside.joint) for r in runs], axis=0)
         three = float(np.mean([r.inside.three for r in runs]))
         rms = float(np.sqrt(np.mean([r.inside.rms[1] ** 2 for r in runs])))
@@ -373,7 +392,16 @@ def vibrations(seeds: int) -> int:
         reported = f'{np.mean(beyond):.3f}' if beyond else 'none beyond'
         inner = ' | '.join(f'{v:.3f}' for v in shares)
         size = f'{rms * 1e6:.2f} | {sd * 1e6:.2f}'
-        print(f'| {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {reported} |', flush=True)
+        print(f'| {20.0 * times:g} | {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {reported} |', flush=True)
+    return 0
+
+
+def changes() -> int:
+    """Print a row for each of ``LOUDER`` and ``EVERY``."""
+    print('| times the noise | a load every | ΔX | ΔY | θ | joint | within 3 sd |\n|---|---|---|---|---|---|---|')
+    for times, every_s in itertools.product(LOUDER, EVERY):
+        found = louder(times, every_s)
+        print(f'| {times:g} | {every_s} s | {_cells(found)} | {found.three:.4f} |', flush=True)
     return 0
 
 
@@ -393,10 +421,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--rows', type=int, help='only the first kinds of noise, and only the table')
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
     parser.add_argument('--vibration', type=int, metavar='SEEDS', help='instead: steady tones, each by so many seeds')
+    parser.add_argument('--changes', action='store_true', help='instead: noise that changes while loads do')
     parser.add_argument('--faults', action='store_true', help='instead: one wrong reading after the other')
     args = parser.parse_args(argv)
     if args.faults:
         return one_wrong(args.rows)
+    if args.changes:
+        return changes()
     if args.vibration:
         return vibrations(args.vibration)
     print(HEAD)
