@@ -32,7 +32,8 @@ LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V.
+    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V at ``mains`` Hz, converter, offsets of x1, y1, x2,
+    y2 V.
     ``stated``: the rig file names the noise of each channel. ``corner``: Hz, at which 1/f noise is as much as the
     white."""
 
@@ -41,6 +42,7 @@ class Row:
     memory: float = 0.0
     heavy: bool = False
     hum: float = 0.0
+    mains: float = 60.0
     bits: int = 16
     offsets: tuple[float, ...] = ()
     stated: bool = False
@@ -53,7 +55,7 @@ ROWS = (
     Row('AR(1) 0.6', memory=0.6),
     Row('AR(1) 0.9', memory=0.9),
     Row('twice the noise', sigmas=(4e-3,) * 6),
-    Row('hum 5 mV', hum=5e-3),
+    *(Row(f'hum 10 mV, {hz:g} Hz', hum=10e-3, mains=hz) for hz in (49.5, 49.9, 50.0, 50.1, 50.5, 60.0)),
     Row('12 bit', bits=12),
     Row('24 bit', bits=24),
     Row('heavy tails', heavy=True),
@@ -62,6 +64,7 @@ ROWS = (
     Row('unequal channels', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3), stated=True),
 )
 UNEQUAL = ROWS[-1]
+HUMS = (1.0, 0.8, 1.0, 0.9, 1.1, 1.0)  # Shares of the hum that the channels have.
 SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))
 """What the estimates do not cover in full."""
 TONES = (5.0, 14.0, 20.0, 28.0, 36.0, 44.0, 48.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
@@ -151,7 +154,7 @@ def volts_of(row: Row, clean: Array, seed: int) -> Array:
         rng = np.random.default_rng(seed)
         out = clean + np.asarray(row.sigmas) * generator.flicker(len(clean), row.corner, rng)
     t = np.arange(len(clean)) / generator.RATE
-    out += row.hum * np.sin(2.0 * np.pi * 60.0 * t)[:, None]
+    out += row.hum * np.sin(2.0 * np.pi * row.mains * t)[:, None] * HUMS
     if row.offsets:
         out[:, [0, 1, 3, 4]] += row.offsets
     return generator.output(out, [], row.bits)

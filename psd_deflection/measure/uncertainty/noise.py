@@ -30,7 +30,7 @@ from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.spectra import lagged_products
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
 from psd_deflection.measure.uncertainty.combinations import Residual, combinations_of
-from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch
+from psd_deflection.measure.uncertainty.vibration import Hum, Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray
 
 SEGMENT_BLOCKS = 50
@@ -117,6 +117,7 @@ class StreamNoise:
         self._signals = 0
         self._search: ToneSearch | None = None
         self.tones: tuple[Tone, ...] = ()
+        self.hum: tuple[Hum, ...] = ()
         self._average: FloatArray | None = None
         self._sure = np.ones(size)
         self._count = 0
@@ -257,9 +258,13 @@ class StreamNoise:
 
     def _in_use(self) -> FloatArray:
         if self._average is None or not self.measured:
-            return self._from_file()
-        # Of the average: each segment alone is so uncertain that much would be taken off its colour.
-        return self._with_steps(_covariance(self._average, self._sure, self._xp))
+            gamma = self._from_file()
+        else:
+            # Of the average: each segment alone is so uncertain that much would be taken off its colour.
+            gamma = self._with_steps(_covariance(self._average, self._sure, self._xp))
+        for hum in self.hum:
+            gamma = gamma + hum.autocovariance(self._size, self._xp)
+        return gamma
 
     def _with_steps(self, gamma: FloatArray) -> FloatArray:
         out = gamma.copy()
@@ -282,19 +287,30 @@ class StreamNoise:
         start = self._segment * SEGMENT_BLOCKS
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
         dots = np.concatenate([d for _, _, d in blocks])
+        if self._search is not None:
+            dots = self._without_hum(self._search, places, dots, np.concatenate(sums))
         series = np.column_stack((dots, self._combinations.fixed(dots)))
         lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size, self._xp)
         self._observed += 1
         moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
         rough = _roughness(places, np.column_stack((moved, series)), self._q, self._xp)
         count = self._readings
-        if self._search is not None:
-            still = np.column_stack((series[:, count:], np.concatenate(sums)))
-            self.tones = self._search.tones(places, moved, still, self._moving, self.tones)
         fixed = _covariance(lags[count:, count:], sure, self._xp)[0, 0]
         self._classify(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()
         return True
+
+    def _without_hum(self, search: ToneSearch, places: IntArray, dots: FloatArray, sums: FloatArray) -> FloatArray:
+        """Look for tones of a segment; return its ``dots`` (n, C), m, without those of the electronics."""
+        moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
+        still = np.column_stack((self._combinations.fixed(dots), sums))
+        known = [tone.frequency for tone in (*self.tones, *self.hum)]
+        found = search.tones(places, moved, still, self._moving, known)
+        self.tones, self.hum = found.moving, ()
+        for frequency in found.hum:
+            dots, hum = search.without(places, dots, frequency)
+            self.hum += (hum,)
+        return dots
 
     def _classify(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
         """``gamma``, ``sure``: as measured, of a segment. ``fixed`` (N,): of the combination that does not move.

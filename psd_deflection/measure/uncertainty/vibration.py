@@ -64,6 +64,28 @@ class Tone(NamedTuple):
     covariance: FloatArray
 
 
+class Hum(NamedTuple):
+    """A tone of the electronics: ``frequency`` in cycles a sample, ``cosine`` and ``sine`` (C,) m of the readings."""
+
+    frequency: float
+    cosine: FloatArray
+    sine: FloatArray
+
+    def autocovariance(self, lags: int, xp: Arithmetic = FIXED) -> FloatArray:
+        """(C, C, lags) m^2: of a reading with another one that is ``lag`` samples later."""
+        angle = np.asarray(2.0 * pi * self.frequency * np.arange(lags), np.float64)
+        a, b = self.cosine[:, None], self.sine[:, None]
+        together = (a * self.cosine + b * self.sine)[:, :, None] * xp.cos_many(angle)
+        return np.asarray(0.5 * (together + (a * self.sine - b * self.cosine)[:, :, None] * xp.sin_many(angle)))
+
+
+class Tones(NamedTuple):
+    """What a segment has: ``moving`` of the link, and the frequencies, cycles a sample, of ``hum``."""
+
+    moving: tuple[Tone, ...] = ()
+    hum: tuple[float, ...] = ()
+
+
 class ToneSearch:
     """Looks for tones in segments of ``blocks`` blocks of ``size`` samples."""
 
@@ -87,15 +109,15 @@ class ToneSearch:
         self._share = np.clip((bins - middle[self._left]) / _GROUP, 0.0, 1.0)[:, None]
 
     def tones(
-        self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[Tone] = ()
-    ) -> tuple[Tone, ...]:
+        self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[float] = ()
+    ) -> Tones:
         """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
         ``moving`` (n, a), m: combinations of the readings that move with the link, ``turn`` (a, C) their rows.
-        ``still`` (n, b), m: what cannot move. ``known``: the tones of the segment before: those may be weaker.
+        ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may be weaker.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
-            return ()
+            return Tones()
         count = moving.shape[1]
         series = _filled(places, np.column_stack((moving, still)), self._length)
         spectrum = transform(series * self._window[:, None])
@@ -104,12 +126,12 @@ class ToneSearch:
         free = np.zeros(len(power), dtype=bool)
         free[self._first : self._last + 1] = True
         limit = np.full(len(power), SIGNIFICANT)
-        for tone in known:
-            at = round(tone.frequency * self._length)
+        for at in (round(frequency * self._length) for frequency in known):
             limit[max(at - _NARROW, 0) : at + _NARROW + 1] = _OBSERVED
         peaks = above[:, :count].max(axis=1) / limit
         scale = self._scale * self._xp.square(self._length / len(places))
         out: list[Tone] = []
+        hum: list[float] = []
         for _ in range(_MOST):
             peak = int(np.argmax(np.where(free, peaks, 0.0)))
             if not free[peak] or peaks[peak] < 1.0:
@@ -120,16 +142,28 @@ class ToneSearch:
             strength = self._xp.sum(power[band], 0)
             observed = above[band].max(axis=0) >= _OBSERVED
             moved = strength[:count] * observed[:count]
+            weight = self._xp.sum(power[band, :count] * observed[:count], 1)
+            mean = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
+            frequency = float(mean) / float(self._xp.sum(weight, 0)) / self._length
             if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
+                hum.append(frequency)
                 continue
             own = spectrum[band, :count] * observed[:count]
             cross = self._xp.times_conjugate(own[:, :, None], own[:, None, :]).real
             covariance = scale * self._xp.sum(np.ascontiguousarray(cross), 0)
-            weight = self._xp.sum(power[band, :count] * observed[:count], 1)
-            mean = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
-            frequency = float(mean) / float(self._xp.sum(weight, 0)) / self._length
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
-        return tuple(out)
+        return Tones(tuple(out), tuple(hum))
+
+    def without(self, places: IntArray, dots: FloatArray, frequency: float) -> tuple[FloatArray, Hum]:
+        """``dots`` (n, C), m, at ``places`` (n,) less their hum of that frequency, by weighted least squares."""
+        xp, angle = self._xp, np.asarray(2.0 * pi * frequency * places, np.float64)
+        waves = np.stack((xp.cos_many(angle), xp.sin_many(angle)), axis=1)
+        weighted = waves * self._window[places, None]
+        ((cc, cs), (_, ss)) = xp.einsum('si,sj->ij', weighted, waves).tolist()
+        along, across = xp.einsum('si,sc->ic', weighted, dots - xp.sum(dots, 0) / len(dots))
+        det = cc * ss - cs * cs
+        hum = Hum(frequency, (ss * along - cs * across) / det, (cc * across - cs * along) / det)
+        return dots - waves[:, :1] * hum.cosine - waves[:, 1:] * hum.sine, hum
 
     def _floor(self, power: FloatArray) -> FloatArray:
         """Of each bin (F,) of each series the power of the noise about it, between the medians of groups of bins."""

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from blind.coverage import Row, coarse, motion, volts_of
+from blind.coverage import Row, coarse, louder, motion, volts_of
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_estimator import ConverterSteps
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
