@@ -32,8 +32,8 @@ LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V at ``mains`` Hz, converter, offsets of x1, y1, x2,
-    y2 V.
+    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V at ``mains`` Hz, converter, offsets of x1, y1,
+    x2, y2 V.
     ``stated``: the rig file names the noise of each channel. ``corner``: Hz, at which 1/f noise is as much as the
     white."""
 
@@ -196,8 +196,8 @@ def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeli
 
 
 def louder(times: float, every_s: int, rest_s: int = 10, seed: int = 1) -> Inside:
-    """The noise becomes so many ``times`` that of ``rest_s`` at rest as the load begins to change ``every_s``: from 10 s
-    after that on."""
+    """``rest_s`` at rest; then so many ``times`` the noise, while the load changes ``every_s``. Counted from 10 s later
+    on."""
     fine = _poses(rest_s, 40 // every_s, every_s)
     clean, truth = optics_of(fine), middles(fine)
     volts = volts_of(ROWS[0], clean, seed)
@@ -422,6 +422,7 @@ def _job(job: tuple[Row, str]) -> tuple[Row, str, Scored]:
 def main(argv: Sequence[str] | None = None) -> int:
     parser = options(__doc__, jobs=2)
     parser.add_argument('--rows', type=int, help='only the first kinds of noise, and only the table')
+    parser.add_argument('--only', default='', metavar='TEXT', help='only kinds of noise with these words')
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
     parser.add_argument('--vibration', type=int, metavar='SEEDS', help='instead: steady tones, each by so many seeds')
     parser.add_argument('--changes', action='store_true', help='instead: noise that changes while loads do')
@@ -436,15 +437,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(HEAD)
     print('|---' * (HEAD.count('|') - 1) + '|')
     motion(100, 16)
-    pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
-    pairs += [(row, 'none') for row in SLOW] if args.rows is None else []
+    rows = [row for row in ROWS[: args.rows] if args.only in row.label]
+    pairs = [(row, loss) for row in rows for loss in list(LOSSES)[: args.losses]]
+    pairs += [(row, 'none') for row in SLOW] if args.rows is None and not args.only else []
     cost: Array | None = None
     for row, loss, s in over(_job, pairs, args.jobs):
         print(
             _line(row.label if loss == 'none' else '', s.ringing.three, s.rest, s.ringing, s.alarms, loss), flush=True
         )
         cost = np.array(s.rest.rms) / bound(row) if cost is None else cost
-    if cost is None or args.rows is not None:
+    if cost is None or args.only or args.rows is not None:
         return 0
     base = on_a_moving_base()
     print(_line('white, moving base', base.three, None, base))

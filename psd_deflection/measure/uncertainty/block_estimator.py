@@ -162,7 +162,8 @@ class BlockEstimator:
 
     ``full``: all PSDs. ``contradictions``: inconsistent blocks. ``misfits``: blocks with motion that the fit cannot
     follow. ``chi_square``: of the last check, of ``freedom`` degrees. ``excluded``: PSDs (from 1) without which the
-    last block was solved. ``vibrating``: the tones that the last block could not follow. ``on_plate``: whether the PSDs are on the plate: then the noise is measured, and the readings checked.
+    last block was solved. ``vibrating``: the tones that the last block could not follow. ``on_plate``: whether the PSDs
+    are on the plate: then the noise is measured, and the readings checked.
     """
 
     part = 'the fit and the noise of the dots'

@@ -310,7 +310,9 @@ class BlockFit:
                 rest = z - xp.einsum('sk,kza->sza', terms.q[:, :reported], c)
                 missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / free, 0.0)
             covariance[:, self._diagonal, self._diagonal] += missed
-        vibrating = self._vibrate(covariance, x, weights) if self._vibrations else [()] * blocks
+        vibrating: list[tuple[int, ...]] = [()] * blocks
+        if self._vibrations:
+            vibrating = self._vibrate(covariance, x, weights)
         rows, covariance = self._combinations.back(value, covariance)
         return memories, FittedRun(list(map(tuple, rows.tolist())), covariance, misfit, vibrating)
 

@@ -12,7 +12,8 @@ Motion is no noise. The readings are more than the unknowns, and one combination
 the base line between the dots is than that between the beams) holds still whatever the plate does. A
 segment is at rest where no combination that moves with the link has a block mean that varies much
 more, against its roughness inside the blocks, than the one that does not move. During motion the
-values of the last rest hold. Before there was any rest, the roughness inside the blocks gives each
+values of the last rest hold, times what that combination's roughness has become if it is other in
+segment after segment. Hum is taken off the readings before and put back by its own tone. Before there was any rest, the roughness inside the blocks gives each
 reading's size, and the combination that does not move gives the colour.
 
 A converter's steps set the least noise: rounding to steps of q is noise of variance q^2/12 a sample
@@ -304,7 +305,7 @@ class StreamNoise:
         """Look for tones of a segment; return its ``dots`` (n, C), m, without those of the electronics."""
         moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
         still = np.column_stack((self._combinations.fixed(dots), sums))
-        known = [tone.frequency for tone in (*self.tones, *self.hum)]
+        known = [*(tone.frequency for tone in self.tones), *(hum.frequency for hum in self.hum)]
         found = search.tones(places, moved, still, self._moving, known)
         self.tones, self.hum = found.moving, ()
         for frequency in found.hum:

@@ -4,9 +4,9 @@
 
 A motion whose period is shorter than a block looks like noise to one block: it varies inside, and hardly from mean to
 mean. But noise has no tones. Each second (50 blocks) the spectrum of the combinations of the readings that move with
-the link is searched for peaks above 1/N a sample, 50 Hz for blocks of 20 at 1 kHz, that stand far out of the floor
+the link is searched for peaks above 1/2N a sample, 25 Hz for blocks of 20 at 1 kHz, that stand far out of the floor
 about them (the median of the neighbours). A peak that the combination that does not move has too, or the sum signals,
-is hum of the electronics and no motion.
+is hum of the electronics and no motion (:class:`Hum`): its autocovariance is a cosine, known exactly.
 
 Noise alone makes a bin exceed its floor T times with probability exp(-T); the floor of 50 neighbours is uncertain by
 1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 40 in some thousand hours.
@@ -15,7 +15,8 @@ straight lines, so that a regular gap makes no tone of a slow motion.
 
 What a tone of variance P does to an answer w^T z that is meant for the block's middle is known: it leaves |1 - H|^2 P,
 H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings, and
-:mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used.
+:mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used. A block in which that is
+much reports it; a strong tone below 0.9 cycles a block is followed, and is not.
 """
 
 from collections.abc import Sequence
@@ -114,7 +115,8 @@ class ToneSearch:
         """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
         ``moving`` (n, a), m: combinations of the readings that move with the link, ``turn`` (a, C) their rows.
-        ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may be weaker.
+        ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may
+        be weaker.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
             return Tones()
