@@ -147,7 +147,10 @@ class ToneSearch:
             weight = self._xp.sum(power[band, :count] * observed[:count], 1)
             mean = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
             frequency = float(mean) / float(self._xp.sum(weight, 0)) / self._length
-            if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
+            # Hum is narrow; and of fewer bins less by chance.
+            near = slice(max(peak - _NARROW, self._first), min(peak + _NARROW, self._last) + 1)
+            shown = above[near, count:].max(axis=0) >= _OBSERVED
+            if bool((shown & (self._xp.sum(power[near, count:], 0) > _ELECTRIC * moved.max())).any()):
                 hum.append(frequency)
                 continue
             own = spectrum[band, :count] * observed[:count]
