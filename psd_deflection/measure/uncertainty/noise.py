@@ -13,8 +13,9 @@ the base line between the dots is than that between the beams) holds still whate
 segment is at rest where no combination that moves with the link has a block mean that varies much
 more, against its roughness inside the blocks, than the one that does not move. During motion the
 values of the last rest hold, times what that combination's roughness has become if it is other in
-segment after segment. Hum is taken off the readings before and put back by its own tone. Before there was any rest, the roughness inside the blocks gives each
-reading's size, and the combination that does not move gives the colour.
+segment after segment. Hum is taken off the readings before, and its own tone added afterwards.
+Before there was any rest, the roughness inside the blocks gives each reading's size, and the
+combination that does not move gives the colour.
 
 A converter's steps set the least noise: rounding to steps of q is noise of variance q^2/12 a sample
 (Widrow & Kollar, Quantization Noise, 2008), and what the noise does not dither stays as an error
