@@ -74,9 +74,8 @@ class RecordedVibration:
         if sum(len(places) for places, _, _ in samples) < _LEAST_SHARE * SEGMENT_BLOCKS * self._size:
             return
         places, dots, sums = (np.concatenate(part) for part in zip(*samples, strict=True))
-        moving = self._xp.einsum('sc,ac->sa', dots, self._turn)
         still = np.column_stack((self._combinations.fixed(dots), sums))
-        tones = self._search.tones(places, moving, still, self._turn).moving
+        tones = self._search.tones(places, dots, still, self._turn).moving
         self.seconds += 1
         self._shaken += bool(tones)
         self._loudest = max((*((self._loudest,) if self._loudest else ()), *tones), key=rms_of, default=None)

@@ -304,10 +304,9 @@ class StreamNoise:
 
     def _without_hum(self, search: ToneSearch, places: IntArray, dots: FloatArray, sums: FloatArray) -> FloatArray:
         """Look for tones of a segment; return its ``dots`` (n, C), m, without those of the electronics."""
-        moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
         still = np.column_stack((self._combinations.fixed(dots), sums))
         known = [*(tone.frequency for tone in self.tones), *(hum.frequency for hum in self.hum)]
-        found = search.tones(places, moved, still, self._moving, known)
+        found = search.tones(places, dots, still, self._moving, known)
         self.tones, self.hum = found.moving, ()
         for frequency in found.hum:
             dots, hum = search.without(places, dots, frequency)

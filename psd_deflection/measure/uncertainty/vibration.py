@@ -6,7 +6,8 @@ A motion whose period is shorter than a block looks like noise to one block: it 
 mean. But noise has no tones. Each second (50 blocks) the spectrum of the combinations of the readings that move with
 the link is searched for peaks above 1/2N a sample, 25 Hz for blocks of 20 at 1 kHz, that stand far out of the floor
 about them (the median of the neighbours). A peak that the combination that does not move has too, or the sum signals,
-is hum of the electronics and no motion (:class:`Hum`): its autocovariance is a cosine, known exactly.
+is hum of the electronics and no motion (:class:`Hum`): its autocovariance is a cosine, known exactly. What vibrates
+without a tone is found where readings of two PSDs vary together over a group of bins, and the sums do not.
 
 Noise alone makes a bin exceed its floor T times with probability exp(-T); the floor of 50 neighbours is uncertain by
 1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 40 in some thousand hours.
@@ -19,11 +20,12 @@ H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings,
 much reports it; a strong tone below 0.9 cycles a block is followed, and is not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import pi
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.spectra import transform
@@ -53,6 +55,11 @@ _GROUP = 50
 _NARROW, _BROAD = 3, 0.04
 """Bins to each side, and share of the frequency if that is more, that belong to a tone: the mode of a link that
 something random drives is as broad as its damping."""
+
+_COHERENT, _STILL_COHERENT = 0.7, 0.5
+"""Correlation of readings of two PSDs in a group of bins from which the link vibrates there. Of independent noise it is
+0.12 rms: chance reaches 0.7 once in some 600 hours. The lower one is for a group that vibrated before, and of what
+cannot move from which it is the electronics."""
 
 _MOST = 4
 """Tones that are looked for in a second."""
@@ -97,7 +104,7 @@ class ToneSearch:
         angle = np.asarray(2.0 * pi / self._length * np.arange(self._length), np.float64)
         self._window = 0.5 - 0.5 * xp.cos_many(angle)
         self._scale = 2.0 / (self._length * float(xp.sum(self._window * self._window, 0)))
-        self._first = int(lowest * blocks)
+        self._first, self._followed = int(lowest * blocks), int(FOLLOWED * blocks)
         # At half the sample rate a tone's other half folds onto it.
         self._last = self._length // 2 - 2
         self._groups = max((self._length // 2 - self._first // 2) // _GROUP, 1)
@@ -110,19 +117,23 @@ class ToneSearch:
         self._share = np.clip((bins - middle[self._left]) / _GROUP, 0.0, 1.0)[:, None]
 
     def tones(
-        self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[float] = ()
+        self, places: IntArray, dots: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[float] = ()
     ) -> Tones:
         """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
-        ``moving`` (n, a), m: combinations of the readings that move with the link, ``turn`` (a, C) their rows.
+        ``dots`` (n, C), m: the readings, ``turn`` (a, C): rows of their combinations that move with the link.
         ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may
         be weaker.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
             return Tones()
-        count = moving.shape[1]
-        series = _filled(places, np.column_stack((moving, still)), self._length)
-        spectrum = transform(series * self._window[:, None])
+        count, readings = turn.shape
+        series = _filled(places, np.column_stack((dots, still)), self._length)
+        every = transform(series * self._window[:, None])
+        moving = np.empty((len(every), count), np.complex128)
+        moving.real = self._xp.einsum('fc,ac->fa', every.real[:, :readings], turn)
+        moving.imag = self._xp.einsum('fc,ac->fa', every.imag[:, :readings], turn)
+        spectrum = np.column_stack((moving, every[:, readings:]))
         power = self._xp.power_spectrum(spectrum)
         above = power / self._floor(power)
         free = np.zeros(len(power), dtype=bool)
@@ -153,11 +164,45 @@ class ToneSearch:
             if bool((shown & (self._xp.sum(power[near, count:], 0) > _ELECTRIC * moved.max())).any()):
                 hum.append(frequency)
                 continue
-            own = spectrum[band, :count] * observed[:count]
-            cross = self._xp.times_conjugate(own[:, :, None], own[:, None, :]).real
-            covariance = scale * self._xp.sum(np.ascontiguousarray(cross), 0)
+            covariance = scale * self._together(spectrum[None, band, :count] * observed[:count])[0]
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
+        # What the tones have is theirs already.
+        for band in self._broad(every * free[:, None], readings, known):
+            # The quietest group has the noise alone, or hardly more.
+            noise = np.median(self._grouped(power[:, :count]), axis=1).min(axis=0) / _LN_2
+            covariance = self._together(spectrum[None, band, :count] * free[band, None])[0]
+            covariance[range(count), range(count)] -= np.count_nonzero(free[band]) * noise
+            frequency = 0.5 * (band.start + band.stop - 1) / self._length
+            out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, scale * covariance, turn)))
         return Tones(tuple(out), tuple(hum))
+
+    def _grouped(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """``values`` (F, k) as (groups, bins, k)."""
+        return values[self._start : self._start + self._groups * _GROUP].reshape(self._groups, _GROUP, -1)
+
+    def _together(self, spectra: npt.NDArray[np.complex128]) -> FloatArray:
+        """(g, k, k): how k ``spectra`` (g, bins, k) vary together in each of g groups of bins."""
+        cross = self._xp.times_conjugate(spectra[:, :, :, None], spectra[:, :, None, :]).real
+        return self._xp.sum(np.ascontiguousarray(cross.swapaxes(0, 1)), 0)
+
+    def _broad(self, every: npt.NDArray[np.complex128], readings: int, known: Sequence[float]) -> Iterator[slice]:
+        """The bins, in runs of groups, in which readings of two PSDs vary together and what cannot move does not.
+
+        ``every``: the spectra, those of ``readings`` first.
+        """
+        cross = self._together(self._grouped(every))
+        own = np.sqrt(np.diagonal(cross, axis1=1, axis2=2)) + _LEAST
+        alike = np.abs(cross) / (own[:, :, None] * own[:, None, :])
+        psd = np.arange(readings) // 2
+        coherent = alike[:, :readings, :readings][:, psd[:, None] != psd].max(axis=1)
+        still = alike[:, readings:, readings:]
+        electric = (still - np.eye(still.shape[1])).max(axis=(1, 2)) > _STILL_COHERENT
+        starts = self._start + _GROUP * np.arange(self._groups)
+        held = np.isin(np.arange(self._groups), [(round(f * self._length) - self._start) // _GROUP for f in known])
+        found = (coherent > np.where(held, _STILL_COHERENT, _COHERENT)) & ~electric & (starts >= self._followed)
+        for run in np.split(np.arange(self._groups), np.flatnonzero(np.diff(found)) + 1):
+            if found[run[0]]:
+                yield slice(int(starts[run[0]]), int(starts[run[-1]]) + _GROUP)
 
     def without(self, places: IntArray, dots: FloatArray, frequency: float) -> tuple[FloatArray, Hum]:
         """``dots`` (n, C), m, at ``places`` (n,) less their hum of that frequency, by weighted least squares."""
@@ -172,8 +217,7 @@ class ToneSearch:
 
     def _floor(self, power: FloatArray) -> FloatArray:
         """Of each bin (F,) of each series the power of the noise about it, between the medians of groups of bins."""
-        stop = self._start + self._groups * _GROUP
-        grouped = power[self._start : stop].reshape(self._groups, _GROUP, -1)
+        grouped = self._grouped(power)
         # The median of an exponential distribution is ln 2 of its mean.
         medians = np.median(grouped, axis=1) / _LN_2
         left = medians[self._left]

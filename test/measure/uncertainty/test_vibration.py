@@ -36,7 +36,7 @@ def noise(seed: int, columns: int = 2, n: int = N) -> FloatArray:
 def found(
     moving: FloatArray, still: FloatArray, places: IntArray = ALL, known: tuple[float, ...] = ()
 ) -> tuple[Tone, ...]:
-    return ToneSearch(SIZE, SEGMENT_BLOCKS).tones(places, moving, still, TURN, known).moving
+    return ToneSearch(SIZE, SEGMENT_BLOCKS).tones(places, moving @ TURN, still, TURN, known).moving
 
 
 @pytest.mark.parametrize('hz', [26.0, 36.4, 47.0, 87.0, 130.4, 300.0, 480.0])
@@ -134,6 +134,41 @@ def test_hum_is_taken_off_with_its_phase_in_each_reading() -> None:
     np.testing.assert_allclose(lags, own, atol=1.5e-12)
 
 
+def band_noise(first: int, last: int, seed: int = 5) -> FloatArray:
+    """Random, of 1 rms, with the bins from ``first`` to ``last`` alone."""
+    rng, spectrum = np.random.default_rng(seed), np.zeros(N // 2 + 1, complex)
+    spectrum[first:last] = rng.normal(size=last - first) + 1j * rng.normal(size=last - first)
+    out = np.fft.irfft(spectrum)
+    return np.asarray(out / out.std())
+
+
+def test_readings_that_vary_together_in_a_band_vibrate() -> None:
+    readings, still = noise(1, 4), noise(2)
+    together = np.array([2e-6, 0.0, 2e-6, 0.0])
+    search, turn = ToneSearch(SIZE, SEGMENT_BLOCKS), np.eye(4)
+    shaken = readings + band_noise(120, 155)[:, None] * together
+
+    def of(dots: FloatArray, beside: FloatArray, known: tuple[float, ...] = ()) -> tuple[Tone, ...]:
+        return search.tones(ALL, dots, beside, turn, known).moving
+
+    (one,) = of(shaken, still)
+    assert one.frequency * RATE == pytest.approx(136.5, abs=25.0)
+    np.testing.assert_allclose(one.covariance, np.outer(together, together), atol=1.2e-12)
+    assert of(readings, still) == ()
+    # Two readings of one PSD may have one supply, and so may all the electronics.
+    assert of(readings + band_noise(120, 155)[:, None] * (2e-6, 2e-6, 0.0, 0.0), still) == ()
+    assert of(shaken, still + band_noise(120, 155, 6)[:, None] * 2e-6) == ()
+    # What is weak is believed where it vibrated before, and below 45 Hz the fit follows.
+    weak = readings + band_noise(120, 155)[:, None] * together * 0.22
+    assert of(weak, still) == () != of(weak, still, (0.130,))
+    assert of(readings + band_noise(15, 44)[:, None] * together, still) == ()
+    # A tone beside it is told apart.
+    both = of(shaken + 9e-6 * tone(139.0)[:, None] * (1.0, 0.0, 1.0, 0.0), still)
+    assert [round(t.frequency * RATE, -1) for t in both] == [140.0, 140.0]
+    assert rms_of(both[0]) == pytest.approx(9e-6 / 2.0**0.5, rel=0.1)
+    assert rms_of(both[1]) == pytest.approx(2e-6, rel=0.25)
+
+
 @pytest.mark.parametrize('hz', [50.0, 60.0])
 def test_hum_leaves_the_intervals_as_they_are(hz: float) -> None:
     """10 mV, not the same on all channels. Of 60 Hz the fit followed 2.9 um and said 0.44."""
@@ -152,7 +187,7 @@ def test_slow_motion_steps_and_regular_gaps_make_no_tone() -> None:
 
 
 def test_too_short_segments_have_no_tones() -> None:
-    assert ToneSearch(2, SEGMENT_BLOCKS).tones(ALL[:100], noise(1, n=100), noise(2, n=100), TURN) == Tones()
+    assert ToneSearch(2, SEGMENT_BLOCKS).tones(ALL[:100], noise(1, 3, 100), noise(2, n=100), TURN) == Tones()
     assert found(noise(1, n=1), noise(2, n=1), ALL[:1]) == ()
 
 
