@@ -139,6 +139,11 @@ def _line(found: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _seconds(since_start: float) -> str:
+    """With three decimals; what is rounded to nothing has no sign."""
+    return f'{round(since_start, 3) + 0.0:.3f}'
+
+
 def _row_of(name: str, text: str) -> str:
     return f'  {name:<12} {text}'
 
@@ -148,7 +153,7 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     out += _lines_of_origin(found)
     out += _lines_of_samples(found)
     out += [
-        _row_of('marks' if i == 0 else '', f'{mark["t_s"]:9.3f} s  {mark["text"]}')
+        _row_of('marks' if i == 0 else '', f'{_seconds(mark["t_s"]):>9} s  {mark["text"]}')
         for i, mark in enumerate(found['marks'])
     ]
     out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
@@ -239,6 +244,7 @@ def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
     # What the pipeline remembered at the start is for a replay, and for --json.
     for c in found['changes']:
         values = {k: v for k, v in c['values'].items() if not k.startswith('state.')}
-        reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or f'{len(c["values"])} values of the state'
-        out.append(f'  from block {c["block"]} on: {reported}')
+        remembered = f'{len(c["values"])} values that the estimator remembered, for a replay'
+        reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or remembered
+        out.append(f'  from {_seconds((c["t_ns"] - found["start_ns"]) / 1e9)} s on: {reported}')
     return out
