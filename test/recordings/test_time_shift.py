@@ -123,8 +123,9 @@ def test_six_unlike_loads_tell_offset_and_rate(tmp_path: Path, second: str, ppm:
         lines = [f'{a:.6f},{x},{y},{light}' for a, (x, y, light) in zip(times, readings, strict=True)]
         paths.append(tmp_path / f'{psd}.csv')
         paths[-1].write_text('\n'.join([f't,x{psd},y{psd},sum{psd}', *lines]))
-    clock = join(*paths).offset
-    assert abs(clock.on_second(t[rows]) - 1.3 - (1.0 + 1e-6 * ppm) * t[rows]).max() < 5e-5
+    clock = join(paths[0], paths[1]).offset
+    when = t[rows].astype(np.float64)
+    assert abs(clock.on_second(when) - 1.3 - (1.0 + 1e-6 * ppm) * when).max() < 5e-5
 
 
 def test_convert_joins_two_loggers_and_says_how(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
