@@ -747,11 +747,11 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
         'sensor_rotation (psd 2) is missing from the model besides; adding it and putting the set-up right together '
         f'close the gap from {before} to {left}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
-    unnoted = Finding('load_coverage', late.where, 0.5, 'note it')
+    unannotated = Finding('load_coverage', late.where, 0.5, 'note it')
     partly = {'verdict': 'unknown_effect', 'unknown': (Unknown('', (), 0.5),)}
-    described = sentence(setup=(unnoted,), **partly)
+    described = sentence(setup=(unannotated,), **partly)
     assert 'says: load coverage. sensor_rotation (psd 2) and the set-up put right explain part, but' in described
-    assert dataclasses.replace(found, setup=(unnoted,)).lines()[1] == 'set-up: load_coverage: note it'
+    assert dataclasses.replace(found, setup=(unannotated,)).lines()[1] == 'set-up: load_coverage: note it'
     tree = dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)).tree()
     assert tree['unknown'] == [{'signature': 's', 'depends_on': ['d'], 'explains': 0.4, 'rms': 2e-6, 'law': None}]
     assert tree['setup'] == [
