@@ -104,12 +104,14 @@ def test_times_of_marks_and_changes_count_from_the_start(
         """As of a part that begins within the block of its mark."""
         found = summary(*given)
         moved = {'t_ns': found['start_ns'] + 40_000_000, 'block': 200, 'values': {'state.a': 1.0}}
-        return {**found, 'marks': [{'t_s': -1e-5, 'text': 'on'}], 'changes': [moved]}
+        before = {'t_ns': found['start_ns'] - 1, 'block': 190, 'values': {'psd_1.noise': 0.1}}
+        return {**found, 'marks': [{'t_s': -1e-5, 'text': 'on'}], 'changes': [before, moved]}
 
     monkeypatch.setattr('psd_deflection.cli.recordings.info.summary', part)
     assert main(['info', str(bag)]) == 0
     text = capsys.readouterr().out
     assert 'marks            0.000 s  on' in text
+    assert '  at the start: psd_1.noise = 0.1\n' in text
     assert 'from 0.040 s on: 1 values that the estimator remembered, for a replay' in text
 
 

@@ -139,11 +139,6 @@ def _line(found: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _seconds(since_start: float) -> str:
-    """With three decimals; what is rounded to nothing has no sign."""
-    return f'{round(since_start, 3) + 0.0:.3f}'
-
-
 def _row_of(name: str, text: str) -> str:
     return f'  {name:<12} {text}'
 
@@ -153,7 +148,7 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     out += _lines_of_origin(found)
     out += _lines_of_samples(found)
     out += [
-        _row_of('marks' if i == 0 else '', f'{_seconds(mark["t_s"]):>9} s  {mark["text"]}')
+        _row_of('marks' if i == 0 else '', f'{round(mark["t_s"], 3) + 0.0:9.3f} s  {mark["text"]}')
         for i, mark in enumerate(found['marks'])
     ]
     out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
@@ -246,5 +241,7 @@ def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
         values = {k: v for k, v in c['values'].items() if not k.startswith('state.')}
         remembered = f'{len(c["values"])} values that the estimator remembered, for a replay'
         reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or remembered
-        out.append(f'  from {_seconds((c["t_ns"] - found["start_ns"]) / 1e9)} s on: {reported}')
+        # Of a part the first ones are older than its start.
+        since = (c['t_ns'] - found['start_ns']) / 1e9
+        out.append(f'  {f"from {since:.3f} s on" if since >= 0.0005 else "at the start"}: {reported}')
     return out
