@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -31,7 +32,8 @@ LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V.
+    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V at ``mains`` Hz, converter, offsets of x1, y1,
+    x2, y2 V.
     ``stated``: the rig file names the noise of each channel. ``corner``: Hz, at which 1/f noise is as much as the
     white."""
 
@@ -40,6 +42,7 @@ class Row:
     memory: float = 0.0
     heavy: bool = False
     hum: float = 0.0
+    mains: float = 60.0
     bits: int = 16
     offsets: tuple[float, ...] = ()
     stated: bool = False
@@ -52,7 +55,7 @@ ROWS = (
     Row('AR(1) 0.6', memory=0.6),
     Row('AR(1) 0.9', memory=0.9),
     Row('twice the noise', sigmas=(4e-3,) * 6),
-    Row('hum 5 mV', hum=5e-3),
+    *(Row(f'hum 10 mV, {hz:g} Hz', hum=10e-3, mains=hz) for hz in (49.5, 49.9, 50.0, 50.1, 50.5, 60.0)),
     Row('12 bit', bits=12),
     Row('24 bit', bits=24),
     Row('heavy tails', heavy=True),
@@ -61,10 +64,13 @@ ROWS = (
     Row('unequal channels', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3), stated=True),
 )
 UNEQUAL = ROWS[-1]
+HUMS = (1.0, 0.8, 1.0, 0.9, 1.1, 1.0)  # Shares of the hum that the channels have.
 SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))
 """What the estimates do not cover in full."""
-TONES = (5.0, 20.0, 45.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
+TONES = (5.0, 14.0, 20.0, 28.0, 36.0, 44.0, 48.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
 SHAKEN = (8e-6, 20e-6, 0.1e-3)  # Its amplitudes: dX, dY m, theta rad, each with a phase of its own.
+SIZES = (0.015, 0.05, 0.15, 1.0)  # Times these.
+LOUDER, EVERY = (0.5, 1.0, 2.0, 4.0), (2, 4, 20)  # Times the noise at rest; s from one change of the load to the next.
 
 
 class Inside(NamedTuple):
@@ -113,13 +119,13 @@ def motion(rest_s: int, steps: int) -> tuple[Array, Array]:
     return optics_of(fine), middles(fine)
 
 
-def _poses(rest_s: int, steps: int) -> Array:
-    n = rest_s * 1000
-    loads = np.zeros((n + steps * 5000, 3))
+def _poses(rest_s: int, steps: int, every_s: int = 5) -> Array:
+    n, dwell = rest_s * 1000, every_s * 1000
+    loads = np.zeros((n + steps * dwell, 3))
     for step in range(0, steps, 2):
         # Off the blocks' grid, each at another place in its block.
-        first = n + step * 5000 + 7 * step % SIZE
-        loads[first : first + 5000] = (0.0, -50.0, -29.25)
+        first = n + step * dwell + 7 * step % SIZE
+        loads[first : first + dwell] = (0.0, -50.0, -29.25)
     return generator.motion(loads, 0.585, [])
 
 
@@ -148,7 +154,7 @@ def volts_of(row: Row, clean: Array, seed: int) -> Array:
         rng = np.random.default_rng(seed)
         out = clean + np.asarray(row.sigmas) * generator.flicker(len(clean), row.corner, rng)
     t = np.arange(len(clean)) / generator.RATE
-    out += row.hum * np.sin(2.0 * np.pi * 60.0 * t)[:, None]
+    out += row.hum * np.sin(2.0 * np.pi * row.mains * t)[:, None] * HUMS
     if row.offsets:
         out[:, [0, 1, 3, 4]] += row.offsets
     return generator.output(out, [], row.bits)
@@ -187,6 +193,20 @@ def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeli
         inside(error[ringing], covariance[ringing]),
         pipeline.estimator.contradictions / len(got),
     )
+
+
+def louder(times: float, every_s: int, rest_s: int = 10, seed: int = 1) -> Inside:
+    """``rest_s`` at rest; then so many ``times`` the noise, while the load changes ``every_s``. Counted from 10 s later
+    on."""
+    fine = _poses(rest_s, 40 // every_s, every_s)
+    clean, truth = optics_of(fine), middles(fine)
+    volts = volts_of(ROWS[0], clean, seed)
+    first = rest_s * 1000
+    row = Row('changed', sigmas=tuple(times * s for s in ROWS[0].sigmas))
+    volts[first:] = volts_of(row, clean, seed + 1)[first:]
+    error, covariance, block = _errors(estimates(Pipeline(rig(row)), volts, np.ones(len(volts), bool)), truth)
+    later = block >= (first + 10_000) // SIZE
+    return inside(error[later], covariance[later])
 
 
 def warming(reported: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
@@ -244,12 +264,14 @@ class Shaken(NamedTuple):
     words: str
 
 
-def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **overrides: object) -> Shaken:
-    """A link without load that vibrates with that frequency and the amplitudes ``SHAKEN``, from the first sample on."""
+def shaken(
+    hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, size: float = 1.0, **overrides: object
+) -> Shaken:
+    """A link without load that vibrates with that frequency and ``size`` times ``SHAKEN``, from the first sample on."""
     n = seconds * int(generator.RATE)
     t = np.arange(n * generator.FINER) / (generator.RATE * generator.FINER)
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 3)
-    fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN
+    fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN * size
     pipeline = Pipeline(rig(row, **overrides))
     volts = volts_of(row, optics_of(fine), seed)
     records = list(pipeline.process(chunk(volts)))
@@ -355,15 +377,15 @@ def one_wrong(rows: int | None) -> int:
 
 VIBRATION_SEEDS = 8
 
-SHAKEN_HEAD = '| Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
+SHAKEN_HEAD = '| µm | Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
 
 
 def vibrations(seeds: int) -> int:
-    """Print a row for each of ``TONES``: the mean of so many runs, each with phases and noise of its own."""
+    """Print a row for each of ``SIZES`` and ``TONES``: the mean of so many runs, with phases and noise of their own."""
     print(SHAKEN_HEAD)
     print('|---' * (SHAKEN_HEAD.count('|') - 1) + '|')
-    for hz in TONES:
-        runs = [shaken(hz, seconds=16, seed=seed) for seed in range(1, seeds + 1)]
+    for times, hz in itertools.product(SIZES, TONES):
+        runs = [shaken(hz, seconds=16, seed=seed, size=times) for seed in range(1, seeds + 1)]
         shares = np.mean([(*r.inside.axes, r.inside.joint) for r in runs], axis=0)
         three = float(np.mean([r.inside.three for r in runs]))
         rms = float(np.sqrt(np.mean([r.inside.rms[1] ** 2 for r in runs])))
@@ -373,7 +395,16 @@ def vibrations(seeds: int) -> int:
         reported = f'{np.mean(beyond):.3f}' if beyond else 'none beyond'
         inner = ' | '.join(f'{v:.3f}' for v in shares)
         size = f'{rms * 1e6:.2f} | {sd * 1e6:.2f}'
-        print(f'| {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {reported} |', flush=True)
+        print(f'| {20.0 * times:g} | {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {reported} |', flush=True)
+    return 0
+
+
+def changes() -> int:
+    """Print a row for each of ``LOUDER`` and ``EVERY``."""
+    print('| times the noise | a load every | ΔX | ΔY | θ | joint | within 3 sd |\n|---|---|---|---|---|---|---|')
+    for times, every_s in itertools.product(LOUDER, EVERY):
+        found = louder(times, every_s)
+        print(f'| {times:g} | {every_s} s | {_cells(found)} | {found.three:.4f} |', flush=True)
     return 0
 
 
@@ -391,26 +422,31 @@ def _job(job: tuple[Row, str]) -> tuple[Row, str, Scored]:
 def main(argv: Sequence[str] | None = None) -> int:
     parser = options(__doc__, jobs=2)
     parser.add_argument('--rows', type=int, help='only the first kinds of noise, and only the table')
+    parser.add_argument('--only', default='', metavar='TEXT', help='only kinds of noise with these words')
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
     parser.add_argument('--vibration', type=int, metavar='SEEDS', help='instead: steady tones, each by so many seeds')
+    parser.add_argument('--changes', action='store_true', help='instead: noise that changes while loads do')
     parser.add_argument('--faults', action='store_true', help='instead: one wrong reading after the other')
     args = parser.parse_args(argv)
     if args.faults:
         return one_wrong(args.rows)
+    if args.changes:
+        return changes()
     if args.vibration:
         return vibrations(args.vibration)
     print(HEAD)
     print('|---' * (HEAD.count('|') - 1) + '|')
     motion(100, 16)
-    pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
-    pairs += [(row, 'none') for row in SLOW] if args.rows is None else []
+    rows = [row for row in ROWS[: args.rows] if args.only in row.label]
+    pairs = [(row, loss) for row in rows for loss in list(LOSSES)[: args.losses]]
+    pairs += [(row, 'none') for row in SLOW] if args.rows is None and not args.only else []
     cost: Array | None = None
     for row, loss, s in over(_job, pairs, args.jobs):
         print(
             _line(row.label if loss == 'none' else '', s.ringing.three, s.rest, s.ringing, s.alarms, loss), flush=True
         )
         cost = np.array(s.rest.rms) / bound(row) if cost is None else cost
-    if cost is None or args.rows is not None:
+    if cost is None or args.only or args.rows is not None:
         return 0
     base = on_a_moving_base()
     print(_line('white, moving base', base.three, None, base))

@@ -206,7 +206,8 @@ def replay(
     """The estimates of a recording, computed as the live node computes them.
 
     ``recording``: from :func:`open` or :func:`simulate`, or its path. ``rig``: the rig or its parameter file; by
-    default the parameters in the recording, which give the messages that were published, bit for bit.
+    default the parameters in the recording, which give the messages that were published, bit for bit. A rig without a
+    zero gets the recorded one.
     ``solver``: by default that of the rig.
 
     The result has numpy arrays (``t``, ``dx``, ``dy``, ``theta``, ``sd``, ``covariance``, ``wrench``), ``to_pandas()``
@@ -218,11 +219,16 @@ def replay(
     import warnings
 
     from psd_deflection.recordings.recording import Recording
-    from psd_deflection.recordings.replay.engine import replayed_estimates, rig_at_start, warnings_about_rig
+    from psd_deflection.recordings.replay.engine import (
+        replayed_estimates,
+        rig_at_start,
+        warnings_about_rig,
+        with_recorded_zero,
+    )
     from psd_deflection.rig.config import replace_values
 
     opened = recording if isinstance(recording, Recording) else open(recording)
-    known = rig_at_start(opened) if rig is None else _rig(rig)
+    known = rig_at_start(opened) if rig is None else with_recorded_zero(opened, _rig(rig), 'the rig')
     if solver is not None:
         known = replace_values(known, {'solver': solver, 'solvers': [solver]}, 'replay')
     if rig is None:

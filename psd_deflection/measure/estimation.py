@@ -185,7 +185,7 @@ class Estimation:
         """Covariance (3, 3) of what vibrates too fast for a block: of the pose and of its rate, in SI units."""
         gain = self.gain_at_rest()
         pose, rate = np.zeros((3, 3)), np.zeros((3, 3))
-        for tone in self.estimator.noise.tones:
+        for tone in self.estimator.vibrating:
             own = self._xp.einsum('ic,cd,jd->ij', gain, tone.covariance, gain)
             pose += own
             rate += self._xp.square(2.0 * pi * tone.frequency * self._rig.converter.sample_rate_hz) * own

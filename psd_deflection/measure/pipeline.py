@@ -495,7 +495,7 @@ class Pipeline:
         systematic = self.estimation.systematic
         covariance = moved.covariance if systematic is None else moved.covariance + systematic
         velocity_covariance = moved.velocity_covariance
-        if self.estimator.noise.tones:
+        if self.estimator.vibrating:
             pose, rate = self.estimation.vibration()
             covariance, velocity_covariance = covariance + pose, velocity_covariance + rate
         dx, dy, theta = moved.pose.tolist()

@@ -12,7 +12,7 @@ from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS
-from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_of
+from psd_deflection.measure.uncertainty.vibration import FOLLOWED, Tone, ToneSearch, rms_of
 from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, FloatArray, IntArray, ParameterChange, SampleBlock
@@ -37,7 +37,7 @@ class RecordedVibration:
         self._light = rig.estimator.sum_min
         self._volt = rig.sensitivities.mean(axis=1)
         self._channels = 3 * len(rig.psds)
-        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, xp)
+        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, xp, FOLLOWED)
         self._segment = -1
         self._samples: list[tuple[IntArray, FloatArray, FloatArray]] = []
         self._loudest: Tone | None = None
@@ -76,7 +76,7 @@ class RecordedVibration:
         places, dots, sums = (np.concatenate(part) for part in zip(*samples, strict=True))
         moving = self._xp.einsum('sc,ac->sa', dots, self._turn)
         still = np.column_stack((self._combinations.fixed(dots), sums))
-        tones = self._search.tones(places, moving, still, self._turn)
+        tones = self._search.tones(places, moving, still, self._turn).moving
         self.seconds += 1
         self._shaken += bool(tones)
         self._loudest = max((*((self._loudest,) if self._loudest else ()), *tones), key=rms_of, default=None)

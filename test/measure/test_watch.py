@@ -180,7 +180,6 @@ def test_readings_without_noise_are_watched_too() -> None:
     assert fed.watch.alarm.channel == 'x1'
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(('a', 'b'), [(1, 2), (1, 3), (2, 3)])
 def test_each_base_line_of_three_psds_is_watched(a: int, b: int) -> None:
     """Both dots go apart along the line between their PSDs, soon after the begin."""
@@ -211,6 +210,7 @@ def test_torque_response_off_link_model_raises_alarm(share: float, alarm: bool) 
         assert fed.watch.alarm.channel == 'theta'
         shift = -10.0 * (share - 1.0) * COMPLIANCE[2]
         assert fed.watch.alarm.shift == pytest.approx(shift, rel=0.05)
+        assert fed.watch.alarm.sd == pytest.approx((40e-6 + 0.02 * abs(20.6 * COMPLIANCE[2])) / 6.0, rel=0.01)
         assert fed.watch.alarm.words.startswith(f'theta is {1e6 * fed.watch.alarm.shift:+.2f} µrad off')
 
 
@@ -268,6 +268,9 @@ def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool) -> N
     fed = Fed()
     fed.load(0.0, 0.0)
     fed.run(6.0, under(0.0, 0.0))
+    # Noted less than three seconds before the next: its pose is not yet sure, so the one before it counts.
+    fed.load(0.0, -20.0)
+    fed.run(2.6, under(0.0, -20.0))
     fed.load(0.0, -40.0)
     fed.run(6.0, under(0.0, -40.0 * share))
     found = fed.watch.alarm
@@ -343,16 +346,20 @@ def page(values: records.FloatArray, least: float) -> Expected:
     raise AssertionError('no alarm that ends')
 
 
-def test_an_alarm_is_that_of_a_second_reckoning() -> None:
-    """psd_1 is moved across the base line, so that this stays as long, as soon as its level is known; then back."""
+@pytest.mark.parametrize('wander', [0.0, 0.6e-6])
+def test_an_alarm_is_that_of_a_second_reckoning(wander: float) -> None:
+    """psd_1 is moved across the base line, so that this stays as long, as soon as its level is known; then back.
+
+    With ``wander`` m all go from place to place, so that the windows' means differ by more than they scatter.
+    """
     fed, dots = Fed(), []
     fed.load(0.0, 0.0)
     moved = 4e-6 * np.array([0.07, -0.1, 0.0, 0.0]) / np.hypot(0.07, 0.1)
 
     def window(number: int) -> None:
         """All shake alike, now more, now less, so that what is usual is no wander from window to window."""
-        size = 8.2e-6 if number == 20 else (2.0 + 0.5 * (3 * number % 7)) * 1e-6
-        still = REST + moved * (7 <= number < 19)
+        size = {12: 8.2e-6, 20: 11e-6}.get(number, (2.0 + 0.5 * (3 * number % 7)) * 1e-6)
+        still = REST + moved * (7 <= number < 19) + wander * (number % 2)
         dots.append(fed.run(0.5, lambda t: still + size * np.sin(12.0 * np.pi * t)[:, None]))
 
     for number in range(19):

@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+import psd_deflection
 from psd_deflection import __version__
 from psd_deflection.cli.main import main
 from psd_deflection.model.solvers.interface import Solutions
 from psd_deflection.recordings.provenance import NAMES, differences, provenance
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.comparison import agree
+from psd_deflection.recordings.replay.engine import open_for_replay
 from psd_deflection.recordings.write import bag_writer
 
+ROOT = Path(__file__).parents[2]
 POSE = {'position': {'x': 1e-3, 'y': -2e-3, 'z': 0.0}, 'orientation': {'x': 0.0, 'y': 0.0, 'z': 1e-3, 'w': 1.0}}
 
 
@@ -153,3 +156,25 @@ def test_what_differs_is_named_with_both_values(changes: dict[str, str], found: 
 
 def test_a_recording_that_does_not_say_is_of_another_version() -> None:
     assert differences({}, provenance()) == ['a version that does not say what computed it']
+
+
+def test_a_rig_file_without_a_zero_gets_the_recorded_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    thesis = (ROOT / 'config' / 'thesis_rig.yaml').read_text()
+    zeroed, run = tmp_path / 'zeroed.yaml', str(tmp_path / 'run')
+    zeroed.write_text(thesis.replace('zero: [0.0, 0.0]', 'zero: [3.0e-4, -1.0e-4]'))
+    assert main(['simulate', '--out', run, '--loads', 'constant:0,-10,0:1', '--params-file', str(zeroed)]) == 0
+    mirrored = tmp_path / 'mirrored.yaml'
+    mirrored.write_text(thesis.replace('zero: [', 'axes: [x, -y]\n      zero: ['))
+    for file, words in (
+        (ROOT / 'config' / 'thesis_rig.yaml', 'its zero is used, since '),
+        (mirrored, f'its zero is not used: {mirrored} has other psd_1.axes, psd_2.axes'),
+        (zeroed, ''),
+    ):
+        capsys.readouterr()
+        same = main(['replay', run, '--params-file', str(file), '--compare']) == 0
+        assert same == (file != mirrored)
+        assert ('warning' in capsys.readouterr().err) == bool(words)
+        recording, _ = open_for_replay(run, str(file))
+        assert words in ''.join(recording.warnings)
+    again = psd_deflection.replay(run, psd_deflection.load_rig(ROOT / 'config' / 'thesis_rig.yaml'))
+    assert np.array_equal(again.pose, psd_deflection.replay(run).pose)

@@ -20,7 +20,7 @@ from psd_deflection.measure.uncertainty.consistency import UNMEASURED, Consisten
 from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.outliers import OutlierSearch
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
-from psd_deflection.measure.uncertainty.vibration import Tone, words_of
+from psd_deflection.measure.uncertainty.vibration import Hum, Tone, words_of
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.plate.plate import Tilts
 from psd_deflection.records import FloatArray, IntArray, channel_names, dot_names
@@ -153,7 +153,7 @@ def _common(a: float, b: float, within: float) -> float:
 
 
 NOISE, SEGMENT, SUMS = 'state.noise', 'state.noise_segment', 'state.sums_segment'
-VIBRATION, STEPS, PSDS = 'state.vibration', 'state.converter_steps', 'state.psds.'
+VIBRATION, HUM, STEPS, PSDS = 'state.vibration', 'state.hum', 'state.converter_steps', 'state.psds.'
 """Names of the state; ``PSDS`` goes on with the PSDs (from 0) of a set, such as "state.psds.0_1"."""
 
 
@@ -162,12 +162,12 @@ class BlockEstimator:
 
     ``full``: all PSDs. ``contradictions``: inconsistent blocks. ``misfits``: blocks with motion that the fit cannot
     follow. ``chi_square``: of the last check, of ``freedom`` degrees. ``excluded``: PSDs (from 1) without which the
-    last block was solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near 87 Hz"; '' if
-    nothing is. ``on_plate``: whether the PSDs are on the plate: then the noise is measured, and the readings checked.
+    last block was solved. ``vibrating``: the tones that the last block could not follow. ``on_plate``: whether the PSDs
+    are on the plate: then the noise is measured, and the readings checked.
     """
 
     part = 'the fit and the noise of the dots'
-    prefixes = (NOISE, SUMS, VIBRATION, STEPS, PSDS)
+    prefixes = (NOISE, SUMS, VIBRATION, HUM, STEPS, PSDS)
 
     def __init__(self, rig: Rig, on_plate: bool = True, tilts: Tilts = 'none') -> None:
         """``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs."""
@@ -191,6 +191,7 @@ class BlockEstimator:
         self.contradictions = 0
         self.chi_square = 0.0
         self.misfits = 0
+        self.vibrating: tuple[Tone, ...] = ()
         self._use_noise()
 
     def _model(self) -> tuple[FloatArray | None, Residual | None]:
@@ -225,6 +226,8 @@ class BlockEstimator:
         """
         for run, at in psds.fits(slots, samples):
             self.misfits += run.misfit[at]
+            tones = self.noise.tones
+            self.vibrating = tuple(tones[i] for i in run.vibrating[at])
             yield run, at
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
@@ -270,7 +273,11 @@ class BlockEstimator:
     def _use_noise(self) -> None:
         for psds in (self.full, *self._subsets.values()):
             psds.set_noise(self.noise)
-        self.vibrates = words_of(self.noise.tones, self._rig.converter.sample_rate_hz)
+
+    @property
+    def vibrates(self) -> str:
+        """What the last block could not follow, such as "14 um rms near 87 Hz"; '' if nothing was."""
+        return words_of(self.vibrating, self._rig.converter.sample_rate_hz)
 
     def search_outliers(self, index: int, dots: tuple[float, ...], result: ConsistencyResult) -> None:
         """Take a block into the search for a wrong reading: each inconsistent one, of the others every tenth."""
@@ -332,7 +339,8 @@ class BlockEstimator:
         out: State = {}
         if self.on_plate:
             tones = tuple(v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist()))
-            rows = {NOISE: self.noise.state(), VIBRATION: tones, SEGMENT: self.noise.segment()}
+            hum = tuple(v for h in self.noise.hum for v in (h.frequency, *h.cosine.tolist(), *h.sine.tolist()))
+            rows = {NOISE: self.noise.state(), VIBRATION: tones, HUM: hum, SEGMENT: self.noise.segment()}
             rows |= {SUMS: self.noise.sums(), STEPS: self._converter.state()}
             out |= {name: row for name, row in rows.items() if row}
         sets = {self.full.psds: self.full, **self._subsets}
@@ -345,6 +353,7 @@ class BlockEstimator:
             self._converter.set_state(steps)
             self._use_steps()
         if noise := numbers(values, NOISE, 'the noise of this rig'):
+            self.noise.hum = _hum(numbers(values, HUM, 'the hum') or (), 2 * len(self._rig.psds))
             self.noise.set_state(noise)
             sums = numbers(values, SUMS, 'sum signals of a segment') or ()
             self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or (), sums)
@@ -366,6 +375,15 @@ class BlockEstimator:
         # They need the method that solves them, so they begin when they are first asked for.
         self._pending[psds] = numbers(values, name, 'the fit of these PSDs', size) or ()
         self._subsets.pop(psds, None)
+
+
+def _hum(values: tuple[float, ...], count: int) -> tuple[Hum, ...]:
+    """Return the hum of ``count`` readings. Raises ValueError if it is that of others."""
+    each = 1 + 2 * count
+    if len(values) % each:
+        raise mismatch(HUM, values, f'{each} numbers for each tone')
+    rows = np.reshape(values, (-1, each))
+    return tuple(Hum(float(row[0]), row[1 : 1 + count], row[1 + count :]) for row in rows)
 
 
 def _tones(values: tuple[float, ...], count: int) -> tuple[Tone, ...]:

@@ -30,7 +30,7 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.matrices import AT_ONCE
 from psd_deflection.measure.uncertainty.combinations import combinations_of
-from psd_deflection.measure.uncertainty.vibration import Tone
+from psd_deflection.measure.uncertainty.vibration import MATTERS, Tone
 from psd_deflection.records import FloatArray, IntArray
 
 ORDER = 4
@@ -72,24 +72,27 @@ _WIDEN = 1.0
 
 
 class Fitted(NamedTuple):
-    """``dots`` (C,) m at the stamp, their ``covariance`` (C, C) m^2, ``misfit``: the polynomial does not fit."""
+    """``dots`` (C,) m at the stamp, their ``covariance`` (C, C) m^2, ``misfit``: the polynomial does not fit,
+    ``vibrating``: which tones, from 0, are a share of ``MATTERS`` of the covariance."""
 
     dots: tuple[float, ...]
     covariance: FloatArray
     misfit: bool
+    vibrating: tuple[int, ...]
 
 
 class FittedRun(NamedTuple):
-    """B blocks that were fitted together: ``dots``, ``covariance`` (B, C, C), ``misfit`` of each as of
+    """B blocks that were fitted together: ``dots``, ``covariance`` (B, C, C), ``misfit``, ``vibrating`` of each as of
     :class:`Fitted`."""
 
     dots: list[tuple[float, ...]]
     covariance: FloatArray
     misfit: list[bool]
+    vibrating: list[tuple[int, ...]]
 
     def block(self, at: int) -> Fitted:
         """The fit of block ``at`` (from 0)."""
-        return Fitted(self.dots[at], self.covariance[at], self.misfit[at])
+        return Fitted(self.dots[at], self.covariance[at], self.misfit[at], self.vibrating[at])
 
 
 def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
@@ -307,10 +310,20 @@ class BlockFit:
                 rest = z - xp.einsum('sk,kza->sza', terms.q[:, :reported], c)
                 missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / free, 0.0)
             covariance[:, self._diagonal, self._diagonal] += missed
-        for vibration in self._vibrations:
-            covariance += self._residual_of(vibration, x, weights)
+        vibrating: list[tuple[int, ...]] = [()] * blocks
+        if self._vibrations:
+            vibrating = self._vibrate(covariance, x, weights)
         rows, covariance = self._combinations.back(value, covariance)
-        return memories, FittedRun(list(map(tuple, rows.tolist())), covariance, misfit)
+        return memories, FittedRun(list(map(tuple, rows.tolist())), covariance, misfit, vibrating)
+
+    def _vibrate(self, covariance: FloatArray, x: FloatArray, weights: FloatArray | None) -> list[tuple[int, ...]]:
+        """Add what vibrates to the ``covariance`` (B, C, C) of blocks; for each the tones that matter there."""
+        parts = [self._residual_of(vibration, x, weights) for vibration in self._vibrations]
+        for part in parts:
+            covariance += part
+        own = MATTERS * covariance[:, self._diagonal, self._diagonal]
+        matters = np.stack([(part[:, self._diagonal, self._diagonal] > own).any(axis=1) for part in parts], axis=1)
+        return [tuple(np.flatnonzero(row).tolist()) for row in matters]
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""

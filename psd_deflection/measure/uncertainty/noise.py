@@ -12,8 +12,10 @@ Motion is no noise. The readings are more than the unknowns, and one combination
 the base line between the dots is than that between the beams) holds still whatever the plate does. A
 segment is at rest where no combination that moves with the link has a block mean that varies much
 more, against its roughness inside the blocks, than the one that does not move. During motion the
-values of the last rest hold. Before there was any rest, the roughness inside the blocks gives each
-reading's size, and the combination that does not move gives the colour.
+values of the last rest hold, times what that combination's roughness has become if it is other in
+segment after segment. Hum is taken off the readings before, and its own tone added afterwards.
+Before there was any rest, the roughness inside the blocks gives each reading's size, and the
+combination that does not move gives the colour.
 
 A converter's steps set the least noise: rounding to steps of q is noise of variance q^2/12 a sample
 (Widrow & Kollar, Quantization Noise, 2008), and what the noise does not dither stays as an error
@@ -30,7 +32,7 @@ from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.spectra import lagged_products
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
 from psd_deflection.measure.uncertainty.combinations import Residual, combinations_of
-from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch
+from psd_deflection.measure.uncertainty.vibration import Hum, Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray
 
 SEGMENT_BLOCKS = 50
@@ -47,6 +49,9 @@ _LEAST_SHARE = 0.5
 
 _PAIRS = 0.4
 """Least share of pairs of samples that are both present, of the samples that are."""
+
+_HEAD = 6
+"""Numbers of a state before the average."""
 
 _SHARES = (0.0, 0.03, 0.1, 0.3, 1.0)
 """Parts of the sure autocovariance that are tried."""
@@ -71,7 +76,10 @@ _FALLEN = 0.4
 """Times the variance so far: what was taken for noise was motion, or the noise is less now."""
 
 _PATIENCE = 3
-"""Segments in a row at rest and louder: the noise is more now."""
+"""Segments in a row at rest and louder, or in which what does not move has ``_OTHER`` noise: the noise is other now."""
+
+_OTHER = 1.4
+"""Times the roughness so far of what does not move, or the inverse. Chance does it once in 10^7 segments."""
 
 
 class StreamNoise:
@@ -99,7 +107,7 @@ class StreamNoise:
         self._size = size
         self._xp = xp
         count = self._readings = 2 * len(centers)
-        self._wanted = 4 + count * count * size
+        self._wanted = _HEAD + count * count * size
         self._stated = np.broadcast_to(variances, (count,))
         self._steps = np.broadcast_to(steps, (count,))
         # Motion is judged with the largest.
@@ -111,11 +119,13 @@ class StreamNoise:
         self._signals = 0
         self._search: ToneSearch | None = None
         self.tones: tuple[Tone, ...] = ()
+        self.hum: tuple[Hum, ...] = ()
         self._average: FloatArray | None = None
         self._sure = np.ones(size)
         self._count = 0
         self._observed = 0
-        self._louder = 0
+        self._louder = self._other = 0
+        self._rough = 0.0
         self.at_rest = False
         self._segment = -1
         self._blocks: list[tuple[int, IntArray, FloatArray]] = []  # Bound: emptied when it is full.
@@ -226,18 +236,19 @@ class StreamNoise:
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        head = (float(self._observed), float(self._count), float(self._louder), float(self.at_rest))
+        counts = (self._observed, self._count, self._louder, self._other, self.at_rest)
+        head = (*map(float, counts), self._rough)
         return head if self._average is None else (*head, *self._average.ravel().tolist(), *self._sure.tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
         wanted = self._wanted + self._size
-        if len(values) not in (4, wanted):
+        if len(values) not in (_HEAD, wanted):
             raise ValueError(f'noise of {self._size} samples a block has {wanted} values, not {len(values)}')
-        self._observed, self._count, self._louder = (int(v) for v in values[:3])
-        self.at_rest = bool(values[3])
-        average = np.array(values[4 : self._wanted])
-        self._average = average.reshape(self._readings, self._readings, -1) if len(values) > 4 else None
+        self._observed, self._count, self._louder, self._other, at_rest = (int(v) for v in values[:5])
+        self.at_rest, self._rough = bool(at_rest), values[5]
+        average = np.array(values[_HEAD : self._wanted])
+        self._average = average.reshape(self._readings, self._readings, -1) if len(values) > _HEAD else None
         self._sure = np.array(values[self._wanted :]) if len(values) > self._wanted else np.ones(self._size)
         self.gamma = self._in_use()
 
@@ -249,9 +260,13 @@ class StreamNoise:
 
     def _in_use(self) -> FloatArray:
         if self._average is None or not self.measured:
-            return self._from_file()
-        # Of the average: each segment alone is so uncertain that much would be taken off its colour.
-        return self._with_steps(_covariance(self._average, self._sure, self._xp))
+            gamma = self._from_file()
+        else:
+            # Of the average: each segment alone is so uncertain that much would be taken off its colour.
+            gamma = self._with_steps(_covariance(self._average, self._sure, self._xp))
+        for hum in self.hum:
+            gamma = gamma + hum.autocovariance(self._size, self._xp)
+        return gamma
 
     def _with_steps(self, gamma: FloatArray) -> FloatArray:
         out = gamma.copy()
@@ -274,19 +289,30 @@ class StreamNoise:
         start = self._segment * SEGMENT_BLOCKS
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
         dots = np.concatenate([d for _, _, d in blocks])
+        if self._search is not None:
+            dots = self._without_hum(self._search, places, dots, np.concatenate(sums))
         series = np.column_stack((dots, self._combinations.fixed(dots)))
         lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size, self._xp)
         self._observed += 1
         moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
         rough = _roughness(places, np.column_stack((moved, series)), self._q, self._xp)
         count = self._readings
-        if self._search is not None:
-            still = np.column_stack((series[:, count:], np.concatenate(sums)))
-            self.tones = self._search.tones(places, moved, still, self._moving)
         fixed = _covariance(lags[count:, count:], sure, self._xp)[0, 0]
         self._classify(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()
         return True
+
+    def _without_hum(self, search: ToneSearch, places: IntArray, dots: FloatArray, sums: FloatArray) -> FloatArray:
+        """Look for tones of a segment; return its ``dots`` (n, C), m, without those of the electronics."""
+        moved = self._xp.einsum('sc,ac->sa', dots, self._moving)
+        still = np.column_stack((self._combinations.fixed(dots), sums))
+        known = [*(tone.frequency for tone in self.tones), *(hum.frequency for hum in self.hum)]
+        found = search.tones(places, moved, still, self._moving, known)
+        self.tones, self.hum = found.moving, ()
+        for frequency in found.hum:
+            dots, hum = search.without(places, dots, frequency)
+            self.hum += (hum,)
+        return dots
 
     def _classify(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
         """``gamma``, ``sure``: as measured, of a segment. ``fixed`` (N,): of the combination that does not move.
@@ -301,7 +327,7 @@ class StreamNoise:
         still = bool((means * fixed_rough <= _MOTION * rough[: len(moving)] * fixed_mean).all())
         if not self.at_rest:
             if still:
-                self._restart(gamma, sure)
+                self._restart(gamma, sure, fixed_rough)
                 self.at_rest = True
             else:
                 self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough), np.ones(self._size))
@@ -312,14 +338,21 @@ class StreamNoise:
         if (ratio > _RISEN).any():
             self._louder = self._louder + 1 if still else 0
             if self._louder >= _PATIENCE:
-                self._restart(gamma, sure)
+                self._restart(gamma, sure, fixed_rough)
         elif (ratio < _FALLEN).any():
-            self._restart(gamma, sure)
+            self._restart(gamma, sure, fixed_rough)
         else:
             self._into_average(gamma, sure)
+            self._rough += (fixed_rough - self._rough) / self._count
+        # In motion this alone tells it.
+        other = not self._rough < _OTHER * fixed_rough < _OTHER * _OTHER * self._rough
+        self._other = self._other + 1 if other else 0
+        if self._other >= _PATIENCE:
+            self._restart(before * (fixed_rough / self._rough), self._sure, fixed_rough)
 
-    def _restart(self, gamma: FloatArray, sure: FloatArray) -> None:
-        self._average, self._sure, self._count, self._louder = gamma, sure, 1, 0
+    def _restart(self, gamma: FloatArray, sure: FloatArray, rough: float) -> None:
+        self._average, self._sure, self._rough = gamma, sure, rough
+        self._count, self._louder, self._other = 1, 0, 0
 
     def _into_average(self, gamma: FloatArray, sure: FloatArray) -> None:
         self._louder = 0

@@ -4,9 +4,9 @@
 
 A motion whose period is shorter than a block looks like noise to one block: it varies inside, and hardly from mean to
 mean. But noise has no tones. Each second (50 blocks) the spectrum of the combinations of the readings that move with
-the link is searched for peaks above 1/N a sample, 50 Hz for blocks of 20 at 1 kHz, that stand far out of the floor
+the link is searched for peaks above 1/2N a sample, 25 Hz for blocks of 20 at 1 kHz, that stand far out of the floor
 about them (the median of the neighbours). A peak that the combination that does not move has too, or the sum signals,
-is hum of the electronics and no motion.
+is hum of the electronics and no motion (:class:`Hum`): its autocovariance is a cosine, known exactly.
 
 Noise alone makes a bin exceed its floor T times with probability exp(-T); the floor of 50 neighbours is uncertain by
 1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 40 in some thousand hours.
@@ -15,9 +15,11 @@ straight lines, so that a regular gap makes no tone of a slow motion.
 
 What a tone of variance P does to an answer w^T z that is meant for the block's middle is known: it leaves |1 - H|^2 P,
 H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings, and
-:mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used.
+:mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used. A block in which that is
+much reports it; a strong tone below 0.9 cycles a block is followed, and is not.
 """
 
+from collections.abc import Sequence
 from math import pi
 from typing import NamedTuple
 
@@ -36,8 +38,14 @@ _OBSERVED = 12.0
 _ELECTRIC = 0.01
 """Share of a tone's variance in what cannot move, from which it is hum and no motion."""
 
-_LOWEST = 0.9
-"""Cycles a block: the polynomials of a block follow what is slower."""
+LOWEST = 0.5
+"""Cycles a block: the polynomials of a block follow what is slower, however weak."""
+
+FOLLOWED = 0.9
+"""Cycles a block: they follow what is slower and strong."""
+
+MATTERS = 0.2
+"""Share of a block's variance, from which it says that it vibrates."""
 
 _GROUP = 50
 """Bins of one floor."""
@@ -57,16 +65,39 @@ class Tone(NamedTuple):
     covariance: FloatArray
 
 
+class Hum(NamedTuple):
+    """A tone of the electronics: ``frequency`` in cycles a sample, ``cosine`` and ``sine`` (C,) m of the readings."""
+
+    frequency: float
+    cosine: FloatArray
+    sine: FloatArray
+
+    def autocovariance(self, lags: int, xp: Arithmetic = FIXED) -> FloatArray:
+        """(C, C, lags) m^2: of a reading with another one that is ``lag`` samples later."""
+        angle = np.asarray(2.0 * pi * self.frequency * np.arange(lags), np.float64)
+        a, b = self.cosine[:, None], self.sine[:, None]
+        together = (a * self.cosine + b * self.sine)[:, :, None] * xp.cos_many(angle)
+        return np.asarray(0.5 * (together + (a * self.sine - b * self.cosine)[:, :, None] * xp.sin_many(angle)))
+
+
+class Tones(NamedTuple):
+    """What a segment has: ``moving`` of the link, and the frequencies, cycles a sample, of ``hum``."""
+
+    moving: tuple[Tone, ...] = ()
+    hum: tuple[float, ...] = ()
+
+
 class ToneSearch:
     """Looks for tones in segments of ``blocks`` blocks of ``size`` samples."""
 
-    def __init__(self, size: int, blocks: int, xp: Arithmetic = FIXED) -> None:
+    def __init__(self, size: int, blocks: int, xp: Arithmetic = FIXED, lowest: float = LOWEST) -> None:
+        """``lowest``: cycles a block from which on tones are looked for."""
         self._xp = xp
         self._length = size * blocks
         angle = np.asarray(2.0 * pi / self._length * np.arange(self._length), np.float64)
         self._window = 0.5 - 0.5 * xp.cos_many(angle)
         self._scale = 2.0 / (self._length * float(xp.sum(self._window * self._window, 0)))
-        self._first = int(_LOWEST * blocks)
+        self._first = int(lowest * blocks)
         # At half the sample rate a tone's other half folds onto it.
         self._last = self._length // 2 - 2
         self._groups = max((self._length // 2 - self._first // 2) // _GROUP, 1)
@@ -78,14 +109,17 @@ class ToneSearch:
         self._right = np.minimum(self._left + 1, self._groups - 1)
         self._share = np.clip((bins - middle[self._left]) / _GROUP, 0.0, 1.0)[:, None]
 
-    def tones(self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray) -> tuple[Tone, ...]:
-        """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its floor first.
+    def tones(
+        self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[float] = ()
+    ) -> Tones:
+        """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
         ``moving`` (n, a), m: combinations of the readings that move with the link, ``turn`` (a, C) their rows.
-        ``still`` (n, b), m: what cannot move.
+        ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may
+        be weaker.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
-            return ()
+            return Tones()
         count = moving.shape[1]
         series = _filled(places, np.column_stack((moving, still)), self._length)
         spectrum = transform(series * self._window[:, None])
@@ -93,29 +127,48 @@ class ToneSearch:
         above = power / self._floor(power)
         free = np.zeros(len(power), dtype=bool)
         free[self._first : self._last + 1] = True
-        peaks = above[:, :count].max(axis=1)
+        limit = np.full(len(power), SIGNIFICANT)
+        for at in (round(frequency * self._length) for frequency in known):
+            limit[max(at - _NARROW, 0) : at + _NARROW + 1] = _OBSERVED
+        peaks = above[:, :count].max(axis=1) / limit
         scale = self._scale * self._xp.square(self._length / len(places))
         out: list[Tone] = []
+        hum: list[float] = []
         for _ in range(_MOST):
             peak = int(np.argmax(np.where(free, peaks, 0.0)))
-            if not free[peak] or peaks[peak] < SIGNIFICANT:
+            if not free[peak] or peaks[peak] < 1.0:
                 break
             wide = max(_NARROW, int(_BROAD * peak))
             band = slice(max(peak - wide, self._first), min(peak + wide, self._last) + 1)
             free[band] = False
             strength = self._xp.sum(power[band], 0)
-            observed = above[band].max(axis=0) > _OBSERVED
+            observed = above[band].max(axis=0) >= _OBSERVED
             moved = strength[:count] * observed[:count]
-            if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
+            weight = self._xp.sum(power[band, :count] * observed[:count], 1)
+            mean = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
+            frequency = float(mean) / float(self._xp.sum(weight, 0)) / self._length
+            # Hum is narrow; and of fewer bins less by chance.
+            near = slice(max(peak - _NARROW, self._first), min(peak + _NARROW, self._last) + 1)
+            shown = above[near, count:].max(axis=0) >= _OBSERVED
+            if bool((shown & (self._xp.sum(power[near, count:], 0) > _ELECTRIC * moved.max())).any()):
+                hum.append(frequency)
                 continue
             own = spectrum[band, :count] * observed[:count]
             cross = self._xp.times_conjugate(own[:, :, None], own[:, None, :]).real
             covariance = scale * self._xp.sum(np.ascontiguousarray(cross), 0)
-            weight = self._xp.sum(power[band, :count] * observed[:count], 1)
-            at = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
-            frequency = float(at) / float(self._xp.sum(weight, 0)) / self._length
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
-        return tuple(out)
+        return Tones(tuple(out), tuple(hum))
+
+    def without(self, places: IntArray, dots: FloatArray, frequency: float) -> tuple[FloatArray, Hum]:
+        """``dots`` (n, C), m, at ``places`` (n,) less their hum of that frequency, by weighted least squares."""
+        xp, angle = self._xp, np.asarray(2.0 * pi * frequency * places, np.float64)
+        waves = np.stack((xp.cos_many(angle), xp.sin_many(angle)), axis=1)
+        weighted = waves * self._window[places, None]
+        ((cc, cs), (_, ss)) = xp.einsum('si,sj->ij', weighted, waves).tolist()
+        along, across = xp.einsum('si,sc->ic', weighted, dots - xp.sum(dots, 0) / len(dots))
+        det = cc * ss - cs * cs
+        hum = Hum(frequency, (ss * along - cs * across) / det, (cc * across - cs * along) / det)
+        return dots - waves[:, :1] * hum.cosine - waves[:, 1:] * hum.sine, hum
 
     def _floor(self, power: FloatArray) -> FloatArray:
         """Of each bin (F,) of each series the power of the noise about it, between the medians of groups of bins."""

@@ -183,7 +183,7 @@ class ReplayComparison:
         ]
         if self.rounded and self.changed:
             lines.append(f'  rounding may differ: recorded with {"; ".join(self.changed)}')
-        elif self.rounded:
+        elif self.rounded and self.rounded == self.different:
             lines.append('  rounding differs although the same versions recorded it: please report this')
         lines += [f'  largest difference: {name} {value:.3g}' for name, value in sorted(self._worst.items())]
         if self._first_difference:

@@ -36,6 +36,9 @@ from psd_deflection.records import (
 from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME, ZEROS
 
+READ_BY = ('.type', '.sensitivity', '.axes')
+"""Ends of the names of parameters that make dots of volts: a zero holds for one set of them."""
+
 
 def rig_at_start(recording: Recording) -> Rig:
     """The rig at the start of the recording; the thesis rig if the recording holds none. Raises ConfigError."""
@@ -81,13 +84,15 @@ def open_for_replay(
 ) -> tuple[Recording, Rig]:
     """The recording, cut into the rig's blocks, and the rig: from ``params_file``, else from the recording.
 
-    ``namespace``, ``span``: as :func:`open_recording` has them.
+    ``namespace``, ``span``: as :func:`open_recording` has them. A file without a zero gets the recorded one.
 
     Raises RecordingError and ConfigError.
     """
     recording = open_recording(path, namespace=namespace, span=span)
     rig = rig_at_start(recording) if params_file is None else load_rig(params_file)
     check_psds(recording, rig)
+    if params_file is not None:
+        rig = with_recorded_zero(recording, rig, params_file)
     if recording.block_size != rig.estimator.block_size:
         recording = recording.with_block_size(rig.estimator.block_size)
     return recording, rig
@@ -96,6 +101,24 @@ def open_for_replay(
 def part_of(recording: Recording, span: Span) -> RecordingWindow | None:
     """The part of ``recording`` that is meant, None if that is the whole. Raises as :meth:`Recording.crop` does."""
     return None if span == FULL else RecordingWindow(recording, *span)
+
+
+def with_recorded_zero(recording: Recording, rig: Rig, name: str) -> Rig:
+    """``rig`` with the zero with which ``recording`` starts, as the daemon keeps one, if ``rig`` has none of its own.
+
+    Of other detectors the recorded one is not used. ``recording`` gets a warning of either. ``name``: of the rig.
+    Raises ConfigError.
+    """
+    start = rig_at_start(recording)
+    if rig.zeros.any() or not start.zeros.any():
+        return rig
+    recorded = start.values
+    other = [n for n in recorded if n.endswith(READ_BY) and recorded[n] != rig.values.get(n)]
+    if other:
+        recording.warn(f'{recording.path}: its zero is not used: {name} has other {", ".join(other)}')
+        return rig
+    recording.warn(f'{recording.path}: its zero is used, since {name} has none')
+    return replace_values(rig, start.zeros_by_name, str(recording.path))
 
 
 def check_psds(recording: Recording, rig: Rig) -> None:

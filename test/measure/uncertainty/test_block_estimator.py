@@ -135,7 +135,7 @@ def test_segments_change_the_noise_of_all_sets() -> None:
     still = np.tile(rig.zeros.ravel(), (20, 1))
     for psds, count in ((of.full, 6), (subset, 4)):
         run, _ = next(of.fits(psds, ALL, still[None]))
-        dots, covariance, _ = run.block(0)
+        dots, covariance, _, _ = run.block(0)
         assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
         assert len(dots) == count
     assert not BlockEstimator(rig_of(), False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from blind.coverage import Row, coarse, motion, volts_of
+from blind.coverage import Row, coarse, louder, motion, volts_of
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_estimator import ConverterSteps
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
@@ -157,7 +157,7 @@ def test_another_one_goes_on_from_the_state_to_the_bit() -> None:
     for noise in (one, other):
         feed(noise, more, 5 * SEGMENT_BLOCKS + 7)
     assert (one.gamma == other.gamma).all()
-    with pytest.raises(ValueError, match='344 values, not 5'):
+    with pytest.raises(ValueError, match='346 values, not 5'):
         other.set_state((0.0,) * 5)
 
 
@@ -181,7 +181,7 @@ def test_gaps_take_nothing_off_the_colour_of_hum() -> None:
 def test_what_remembers_nothing_goes_on_as_from_the_start() -> None:
     one, other = stream(), stream()
     other.set_state(one.state())
-    assert one.state() == other.state() == (0.0, 0.0, 0.0, 0.0)
+    assert one.state() == other.state() == (0.0,) * 6
     np.testing.assert_array_equal(one.gamma, other.gamma)
 
 
@@ -195,8 +195,14 @@ RULES = {
     'two louder ones wait': ([1.0, 1.0, 9.0, 9.0], 1.0),
     'the third louder one is believed': ([1.0, 1.0, 9.0, 9.0, 9.0], 9.0),
     'an old one in between begins the count again': ([1.0, 1.0, 9.0, 9.0, 1.0, 9.0, 9.0], 1.0),
-    'so does one in motion': ([1.0, 1.0, 9.0, 9.0, -9.0, 9.0, 9.0], 1.0),
-    'three after it are believed': ([1.0, 1.0, 9.0, -9.0, 9.0, 9.0, 9.0], 9.0),
+    'one in motion counts by what does not move': ([1.0, 1.0, 9.0, 9.0, -9.0], 9.0),
+    'two louder ones in motion wait': ([1.0, 1.0, -9.0, -9.0], 1.0),
+    'the third quieter one in motion is believed': ([1.0, 1.0, *[-0.25] * 3], 0.25),
+    'less than 1.4 times is chance': ([1.0, 1.0, *[-1.35] * 3, *[-0.73] * 3], 1.0),
+    'above 1.4 times is none': ([1.0, 1.0, *[-1.45] * 3], 1.45),
+    'nor is below 0.71 times': ([1.0, 1.0, *[-0.7] * 3], 0.7),
+    'what is as before begins the count again': ([1.0, 1.0, -9.0, -9.0, -1.0, -9.0, -9.0], 1.0),
+    'after a change in motion rest is believed anew': ([1.0, 1.0, *[-9.0] * 3, 8.0], 8.5),
     'the mean is of twenty': ([*[1.0] * 40, 1.4], 1.0 + 0.4 / 20.0),
 }
 """Variances of segments, negative where the plate rings besides; the variance that is used in the end."""
@@ -641,3 +647,11 @@ def test_motion_that_begins_in_lost_samples_is_in_the_intervals(present: Sequenc
         fitted = fit.fit(slots, dots[slots] + SIGMA * rng.normal(size=(len(slots), 4)))
         z.append((np.array(fitted.dots) - dots[-1]) / np.sqrt(np.diag(fitted.covariance)))
     assert np.mean(np.abs(z) < 3.0) > 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('times', [0.5, 2.0])
+def test_noise_that_changes_while_loads_do_is_learnt(times: float) -> None:
+    """A load every 4 s. Of the doubled noise 0.91 of the regions held the truth, of the halved 1.00."""
+    got = louder(times, 4)
+    assert 0.93 < min(*got.axes, got.joint) <= max(*got.axes, got.joint) < 0.975

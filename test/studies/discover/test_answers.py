@@ -152,8 +152,10 @@ def test_a_mistake_is_reported_with_its_line(workspace: Workspace) -> None:
     finding, lines = words('sample_rate', error=-0.2)
     assert (finding.where, finding.value) == ('converter.sample_rate_hz', 0.8)
     assert lines == {'converter.sample_rate_hz': 800.0}
-    finding, lines = words('sensitivity', error=0.5)
-    assert lines == {'amplifier.sensitivity': 1.5 * RIG.amplifier.sensitivity}
+    fit = cast(Fit, SimpleNamespace(effects=(ActiveEffect(of_setup('sensitivity'), {'error': 0.5}),)))
+    for several in (workspace, Workspace(workspace.observations[:1])):
+        _, lines = finding_of_effect(several, fit, 0, 33.0)
+        assert lines == {'amplifier.sensitivity': 1.5 * RIG.amplifier.sensitivity}
     for late, word in ((0.04, 'late: subtract 0.04 s from them'), (-0.04, 'early: add 0.04 s to them')):
         finding, lines = words('load_delay', late_by=late)
         assert (finding.where, finding.value, lines) == ('load_fx load_fy load_tz', late, {})

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover import recorded_rig
 from psd_deflection.studies.discover.applied import directions, ringing_on, unseen
-from psd_deflection.studies.discover.discover import discover, refitted
+from psd_deflection.studies.discover.discover import discover, effective_loads, refitted
 from psd_deflection.studies.discover.hidden import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
@@ -104,7 +105,7 @@ def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     assert excess(comparison, table) == pytest.approx((24.0 * 2000.0, 24.0))
 
 
-def test_free_times_are_settled_again_if_an_effect_fails() -> None:
+def test_free_times_are_settled_again_if_an_effect_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     annotated = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
         annotated[number * DWELL + round(1000 * late) :] = LEVELS[number]
@@ -124,6 +125,12 @@ def test_free_times_are_settled_again_if_an_effect_fails() -> None:
     # If all effects hold, they were settled beside these.
     same = replace(dropped, result=SearchResult(fit, fit))
     assert refitted(same) is same
+    # In two turns; if these close nothing of a gap, there are no more.
+    asked = Mock(return_value=ws)
+    monkeypatch.setattr(Workspace, 'refitted_beside', asked)
+    monkeypatch.setattr(Workspace, 'gap', lambda self, _: 3.0 * off.floor())
+    effective_loads(again)
+    assert asked.call_count == 2
 
 
 def test_what_rings_on_is_free_after_excluded_samples() -> None:

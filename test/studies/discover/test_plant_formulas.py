@@ -169,6 +169,10 @@ def test_few_values_make_the_interval_of_student() -> None:
     nu = sum(variances) ** 2 / sum(v * v / n for v, n in zip(variances, freedom, strict=True))
     wanted = math.sqrt(sum(variances)) * student.ppf(0.975, nu) / norm.ppf(0.975)
     assert sd_of_size(values, both) == pytest.approx(wanted, rel=1e-3)
+    # As many sizes as values leave one degree of freedom, not none.
+    ws = PlantComparison(Pictures(values, {}))
+    each = ws.sd(np.eye(2 * len(x)), np.eye(2 * len(x)))
+    assert each == pytest.approx(math.sqrt(len(x)) * student.ppf(0.975, 1) / norm.ppf(0.975), rel=1e-3)
     # A stated noise is not told by the values: it is the normal law's.
     assert sd_of_size(values, picture, noise=(9.0, 9.0)) == pytest.approx(9.0 / math.sqrt(float(x @ x)), rel=1e-3)
 

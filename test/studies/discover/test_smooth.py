@@ -326,20 +326,32 @@ def test_averages_are_those_over_all_subsets(slabs: FloatArray, near: float, mon
         np.testing.assert_array_equal(nothing, np.zeros((2, 2)))
 
 
-@pytest.mark.parametrize(('size', 'remains'), [(0.5, True), (0.0, False)])
-def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool) -> None:
+class Bounded(LinearPlant):
+    """No effect is simulated with a number that it may not have."""
+
+    def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+        for a in effects:
+            assert all(p.minimum <= a.values[p.name] <= p.maximum for p in a.effect.parameters)
+        return super().simulate(effects)
+
+
+@pytest.mark.parametrize(
+    ('size', 'remains', 'open_level'), [(0.5, True, False), (0.0, False, False), (0.0, False, True)]
+)
+def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool, open_level: bool) -> None:
     """Small terms beside a named effect ten times the noise, of which one number is no amplitude."""
     names = ('a', 'x'), ('a', 'shape'), ('b', 'x'), ('b', 'y'), ('c', 'x'), ('d', 'x')
     truth = (10.0 * SIGMA, 0.9, size * SIGMA, -0.8 * size * SIGMA, 0.6 * size * SIGMA, 0.06 * SIGMA)
     shown = pictures(*names)
-    plant = LinearPlant(shown, sum((v * shown[n] for n, v in zip(names, truth, strict=True)), noise()))
+    plant = Bounded(shown, sum((v * shown[n] for n, v in zip(names, truth, strict=True)), noise()))
+    plant.open_level = open_level
     a = active('a', x=0.5, shape=0.1)
     x, shape = a.effect.parameters
     both = (x, dataclasses.replace(shape, kind='shape'))
     fit = refit(plant, [ActiveEffect(dataclasses.replace(a.effect, parameters=both), a.values)])
     found = [
         (candidate('b', 'x', 'y'), [[1e-3 * shown['b', 'x']], [1e-3 * shown['b', 'y']]]),
-        (candidate('c', 'x'), [[1e-3 * shown['c', 'x']]]),
+        (candidate('c', 'x', least=0.0), [[1e-3 * shown['c', 'x']]]),
         (candidate('d', 'x'), [[1e-3 * shown['d', 'x']]]),
     ]
     got = predictive.predictive_of(plant, fit, Screen(plant, found), np.random.default_rng(0))

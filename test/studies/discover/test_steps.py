@@ -186,12 +186,16 @@ def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) ->
         assert left < 0.9 * of
 
 
-@pytest.mark.parametrize('gain', [900.0, 9e4])
-@pytest.mark.parametrize(('share', 'tried'), [(0.57, []), (0.63, [['b']])])
+@pytest.mark.parametrize(
+    ('gain', 'share', 'tried'),
+    [(gain, *row) for gain in (900.0, 9e4) for row in ((0.57, []), (0.63, [['b']]))]
+    + [(99.5, 0.45, []), (99.5, 0.55, [['b']])],
+)
 def test_what_explains_six_tenths_is_tried_instead(gain: float, share: float, tried: list[list[str]]) -> None:
+    """Of an effect that shows little, half."""
     shown = pictures(A, B)
     shown[B] = math.sqrt(share) * shown[A] + math.sqrt(1.0 - share) * across(shown[B], shown[A])
-    plant = Plant(shown, without_noise((shown[A], gain)) + noise())
+    plant = Plant(shown, without_noise((shown[A], gain)))
     null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
     found = searching(plant, shown, 'ab').alternatives(null, fit, 0, null.chi2 - fit.chi2)
     assert [named(f) for f in found] == tried

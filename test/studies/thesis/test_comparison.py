@@ -291,6 +291,8 @@ def degrees(*values: float) -> list[float]:
     ('pose', 'name', 'printed', 'true'),
     [
         ([1e-3, -2e-3, *degrees(0, 0, 0)], '2.36 ΔY', 2e-3, -2e-3),
+        ([1e-3, 0.0, *degrees(0, 0, 0)], '2.36 ΔY', 0.0, 0.0),
+        ([1e-3, -2e-3, *degrees(1, 0.5, -0.3)], '2.42 ΔX', 1e-3, 1e-3),
         ([1e-3, -2e-3, *degrees(1, 0.5, -0.3)], '2.41 |ω|', *degrees(0.4, 0.3)),
         ([1e-3, -2e-3, *degrees(1, 0.5, 0.3)], '2.41 |ω|', *degrees(1.0, 0.3)),
         ([5e-3, 5e-3, *degrees(3, 1, 1)], '2.44, 2.45 δX^ of PSD 1', 19.043e-6, 20.566e-6),
@@ -325,6 +327,11 @@ def test_corrected_equations_hold_printed_root_never() -> None:
                 sums_hold += abs(row.printed - row.true) < 1e-6
     # A third of poses, as the page says.
     assert 0.25 < sums_hold / 300 < 0.40
+    # Only of beams that are nearly above each other it is real.
+    above = Geometry(np.array([[1e-3, 0.07], [0.0, -0.07]]), np.zeros((2, 2)), np.zeros(2), 0.585)
+    (row,) = (c for c in compared(above, np.array([0.0, 0.0, *degrees(0, 1, 0)])) if c.equation == '2.38 DT')
+    rise = 0.14 * math.tan(math.radians(1.0))
+    assert (row.printed, row.true) == pytest.approx((math.sqrt(rise**2 - 1e-6), math.sqrt(rise**2 + 1e-6)), rel=1e-6)
 
 
 def test_the_stopping_test_holds_at_every_admissible_trial() -> None:
