@@ -33,6 +33,9 @@ export OMP_NUM_THREADS ?= 1
 # uv installs the same packages with a tenth of the work. It is used if it is there; `make UV= run` takes pip all the same.
 UV ?= $(shell command -v uv)
 INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python -m pip install --disable-pip-version-check) --quiet
+# A half-made environment is no environment: what has no pip is made anew, and what could not be made goes.
+HALF_MADE = $(if $(wildcard $(VENV)/pyvenv.cfg),--clear)
+MAKE_VENV = $(PYTHON) -m venv $(HALF_MADE) $(VENV) || { test ! -f $(VENV)/pyvenv.cfg || rm -rf $(VENV); exit 1; }
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
 # Tests that run at a time: they wait for ports, discs and DDS, and three keep two cores busy.
@@ -53,7 +56,7 @@ SOURCES := $(shell find psd_deflection msg_adapters config launch resource -type
 
 $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 14) else f"Python 3.11 to 3.14 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(if $(UV),test -x $(BIN)/python,$(BIN)/python -m pip --version >/dev/null 2>&1) || $(MAKE_VENV)
 	@echo 'setting up $(VENV), once: a minute or so, 0.6 GB'
 	$(call INSTALL,$(VENV)) '.[ros,monitor,plot]' $(if $(WITH),'$(WITH)')
 	touch $@

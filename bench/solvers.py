@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the solvers, beside their peers in the same run: ``python bench/solvers.py``."""
+"""Speed of the solvers, beside their peers in the same run: ``python -m bench.solvers``."""
 
 import argparse
 import functools

@@ -73,7 +73,7 @@ def test_the_nominal_rig_is_a_warning(tmp_path: Path) -> None:
     rows = '\n'.join(f'{i / 1000:.3f},0,0,5,0,0,5' for i in range(40))
     path = tmp_path / 'run.csv'
     path.write_text(f't,x1,y1,sum1,x2,y2,sum2\n{rows}\n')
-    with pytest.warns(UserWarning, match=r'run\.csv: lacks parameters: the nominal rig'):
+    with pytest.warns(UserWarning, match=r'run\.csv: a CSV holds no parameters: the rig of the thesis'):
         assert len(psd_deflection.replay(path)) == 2
     assert len(psd_deflection.replay(path, psd_deflection.load_rig())) == 2
 

@@ -233,7 +233,7 @@ def stale() -> list[str]:
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
 
-OF_THE_TOOLS = re.compile(r'^(make (?!run\b)|python (-m )?(bench|blind|tools)\b)')
+OF_THE_TOOLS = re.compile(r'^(make (?!run\b)|python -m (bench|blind|tools)\b)')
 """Lines of who changes the code: README says that they need `make setup`; a target of make installs what it needs."""
 
 

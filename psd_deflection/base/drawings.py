@@ -11,13 +11,17 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from psd_deflection.base.charts import Chart, Colour, drawn
 from psd_deflection.base.pages import wide
+from psd_deflection.base.tables import optional_library
 from psd_deflection.records import FloatArray
+
+if TYPE_CHECKING:
+    from psd_deflection.base.figures import ShownFigure
 
 LEVELS = 20
 """Of the shade of a cell."""
@@ -72,6 +76,13 @@ def in_page(part: str | Drawing) -> str:
     if isinstance(part, Chart):
         return drawn(part)
     return _bars(part) if isinstance(part, Bars) else _matrix(part)
+
+
+def plotted(drawing: Drawing) -> 'ShownFigure':
+    """Return ``drawing`` as a matplotlib figure. Raises ConfigError if matplotlib is not installed."""
+    figures = optional_library('psd_deflection.base.figures', 'plot()', 'matplotlib', 'plot')
+    figure: ShownFigure = figures.figure_of(drawing)
+    return figure
 
 
 def _bars(bars: Bars) -> str:

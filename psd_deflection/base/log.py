@@ -11,6 +11,10 @@ from typing import Protocol
 INFO, WARNING, ERROR = 20, 30, 40
 
 
+class Note(str):
+    """A text among warnings that reports no fault, only what was taken for granted."""
+
+
 class LogCallback(Protocol):
     """Takes one line for people, from any thread."""
 

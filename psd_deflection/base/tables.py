@@ -98,11 +98,16 @@ class Table:
 
 
 def _library(name: str) -> Any:
+    return optional_library(name, f'to_{name}', name, 'pandas')
+
+
+def optional_library(module: str, what: str, package: str, extra: str) -> Any:
+    """Return ``module``, which ``what`` needs. Raises ConfigError with the lines of pip if ``package`` is missing."""
     try:
-        return importlib.import_module(name)
+        return importlib.import_module(module)
     except ImportError:
         raise ConfigError(
-            f"to_{name} needs {name}: `pip install 'psd_deflection[pandas]'` or `pip install {name}`"
+            f"{what} needs {package}: `pip install 'psd_deflection[{extra}]'` or `pip install {package}`"
         ) from None
 
 

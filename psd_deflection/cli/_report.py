@@ -11,6 +11,7 @@ from typing import Any
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import replace_file
+from psd_deflection.base.log import Note
 from psd_deflection.base.text import json_text, sanitize
 
 LONGEST_LINE = 2000
@@ -18,8 +19,8 @@ LONGEST_LINE = 2000
 
 
 def warn(warning: str) -> None:
-    """One warning on the standard error. It may hold words of a file."""
-    show(f'warning: {warning}', aside=True)
+    """One warning or note on the standard error. It may hold words of a file."""
+    show(f'{"note" if isinstance(warning, Note) else "warning"}: {warning}', aside=True)
 
 
 def show(*lines: str, aside: bool = False) -> None:

@@ -222,7 +222,7 @@ class ContractFrames(PortSource):
     def describe(self) -> Mapping[str, str]:
         """Port, its state, and line speed."""
         return {
-            **self._describe_port('contract frames', self._baud),
+            **self._describe_port('binary frames', self._baud),
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }

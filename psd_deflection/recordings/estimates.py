@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.axes import ranges
+from psd_deflection.base.drawings import plotted
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.recordings.charts import estimates_chart, moments
@@ -157,11 +158,12 @@ class EstimateSeries:
         return self.table().to_xarray()
 
     def plot(self) -> ShownFigure:
-        """dX, dY and theta over time with their 95 % intervals and the marks, as a matplotlib figure."""
-        from psd_deflection.base.figures import figure_of
+        """dX, dY and theta over time with their 95 % intervals and the marks, as a matplotlib figure.
 
+        Raises ConfigError if matplotlib is not installed.
+        """
         marks = moments(self.marks, self._start_ns)
-        return figure_of(estimates_chart(self.t, self.pose, self.sd, self.topic, marks))
+        return plotted(estimates_chart(self.t, self.pose, self.sd, self.topic, marks))
 
     def _summary(self) -> list[tuple[str, str]]:
         rows = [('estimates', str(len(self)))]

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
+from psd_deflection.base.drawings import plotted
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.tables import Table, html_table
 from psd_deflection.base.text import sanitize
@@ -340,11 +341,10 @@ class Recording(abc.ABC):
     def plot(self) -> ShownFigure:
         """The samples over time, with the marks, as a matplotlib figure; of a part: ``.crop(2.0, 5.0).plot()``.
 
-        A notebook shows it; ``.savefig('a.png')`` writes it. Raises RecordingError if there are no samples.
+        A notebook shows it; ``.savefig('a.png')`` writes it. Raises RecordingError if there are no samples,
+        ConfigError if matplotlib is not installed.
         """
-        from psd_deflection.base.figures import figure_of
-
-        return figure_of(samples_chart(self.samples, self.psds, self.moments()))
+        return plotted(samples_chart(self.samples, self.psds, self.moments()))
 
     def _summary(self) -> list[tuple[str, object]]:
         """What is known without reading all of it."""

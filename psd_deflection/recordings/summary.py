@@ -92,7 +92,7 @@ def vibration_of(recording: Recording) -> RecordedVibration | None:
     return RecordedVibration(rig)
 
 
-NO_PARAMETERS = 'parameters: the nominal rig is taken if no rig file is given'
+THESIS_RIG = 'the rig of the thesis is taken; --params-file RIG.yaml (in Python: rig) names another'
 
 _BREAK = 0.5
 """If time and sample numbers disagree by this share, the device was stopped or restarted between two blocks."""
@@ -115,7 +115,7 @@ def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
     if not topics.get(SAMPLES):
         found.append(f'samples ({SAMPLES}): nothing can be computed from it')
     if not recording.parameters:
-        found.append(NO_PARAMETERS)
+        found.append(f'parameters: {THESIS_RIG}')
     if recording.hello is None:
         found.append('what the device says of itself')
     if not topics.get(DEFLECTION):

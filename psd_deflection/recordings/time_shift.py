@@ -34,7 +34,7 @@ INTERPOLATION = 0.02
 LEAST = 1e-12
 """Least share of a movement that rounding leaves."""
 AT_REST = 'the two sets do not move together'
-REPEATS = 'the motion repeats itself, so several shifts fit'
+REPEATS = 'several shifts fit: the motion repeats itself, or the clocks differ by more than 200 µs a second'
 
 
 class TimeShift(NamedTuple):
@@ -52,11 +52,13 @@ class TimeShift(NamedTuple):
     unknown: str = ''
 
 
-def time_shift(first: FloatArray, second: FloatArray, period: float, reach: float, stated: float = 0.0) -> TimeShift:
+def time_shift(
+    first: FloatArray, second: FloatArray, period: float, reach: float, stated: float = 0.0, *, beyond: bool = True
+) -> TimeShift:
     """Return by how much ``second`` (n, q) is later than ``first`` (n, p): rows ``period`` s apart, NaN if lost.
 
     ``reach``: the largest shift of either sign, s; of a short recording a third of its length. ``stated``: what the
-    shift is expected to be, s.
+    shift is expected to be, s. ``beyond``: whether it may be larger than ``reach``.
     """
     finer = int(np.ceil(0.99 * period / STEP_S))
     rows = int(MOST_VALUES * STEP_S / period)
@@ -96,7 +98,9 @@ def time_shift(first: FloatArray, second: FloatArray, period: float, reach: floa
     if possible.all() or fine[at, 0] > UNSHARED:
         return TimeShift(0.0, 0.0, unknown=AT_REST)
     apart = np.count_nonzero(np.diff(possible.astype(np.int8)) == 1) > 1
-    if possible[0] or possible[-1] or apart or _better_elsewhere(a, b, int(near[at]), step, int(possible.sum())):
+    if possible[0] or possible[-1] or apart:
+        return TimeShift(0.0, 0.0, unknown=REPEATS)
+    if beyond and _better_elsewhere(a, b, int(near[at]), step, int(possible.sum())):
         return TimeShift(0.0, 0.0, unknown=REPEATS)
     # Squares of what is unshared, in units of their noise, are a parabola about the shift.
     before, here, after = fine[at - 1 : at + 2] / fine[at] @ values
@@ -174,7 +178,8 @@ def _better_elsewhere(a: FloatArray, b: FloatArray, shift: int, step: int, aroun
     """Whether, of all that both have, another shift of up to half of it leaves less unshared, ``around`` steps away."""
     ours, theirs = a[::step], b[shift % step :: step]
     counts, *sums = _sums_of_shifts(ours, theirs, len(ours) // 2)
-    shares, here = _shares(*sums)[:, 0], shift // step + len(ours) // 2
+    # All pairs together: in the half of a motion one pair may fit by chance, where the whole tells.
+    shares, here = np.log(_shares(*sums)).sum(axis=1), shift // step + len(ours) // 2
     others = counts > 0.4 * counts.max()
     others[max(here - around, 0) : here + around + 1] = False
     return bool((shares[others] < shares[here]).any())

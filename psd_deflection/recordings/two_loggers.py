@@ -3,7 +3,8 @@
 """Two tables of two loggers, each with some of the PSDs and a clock of its own, become one recording.
 
 The time between the clocks is found from the motion. Every sample of the recording is a reading of each table: those
-of the slower table, each with the nearest of the other within half a period. Where there is none, the sample is lost.
+of the slower table, each with the nearest of the other within 3/4 of its period. Where there is none, the sample is
+lost.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from psd_deflection.records import FloatArray, IntArray, RawChunk, channel_names
 STRETCH_S, REACHES_S = 60.0, (2.0, 5.0, 20.0)
 """The motion of so long a part tells the time between the clocks, s: beside the starts, up to one of these, and a third
 of the part."""
-PIECE_S, MOST_PIECES, TURNS = 10.0, 16, 3
+PIECE_S, MOST_PIECES, TURNS = 10.0, 16, 5
 """Pieces of at least this length, at most so many, tell the difference of the clocks' rates, in so many turns."""
 NEAR_S = 0.2
 """Shifts within which a found one is looked for again, s."""
@@ -97,7 +98,7 @@ class JoinedTables(NamedTuple):
     """``recording``: on the first clock, of the tables ``first`` and ``second``. ``offset``: of the second clock.
 
     ``lost``: samples of the slower table without a reading of the other, while both record. ``apart``: rms of the time
-    between the two readings of a sample, s.
+    between the two readings of a sample, s; ``most``: the largest that is accepted, s.
     """
 
     recording: RecordingInMemory
@@ -106,11 +107,12 @@ class JoinedTables(NamedTuple):
     offset: ClockOffset
     lost: int
     apart: float
+    most: float
 
     def sentences(self) -> list[str]:
         """What was found of the clocks, and how the samples were put together."""
         o, way = self.offset, 'more' if self.offset.seconds > 0.0 else 'less'
-        rates = 'the motion does not tell how their rates differ'
+        rates = 'whether their rates differ is unknown: push near the beginning and near the end'
         if o.rate:
             rates = f'it gains {1e6 * o.rate:.1f} ± {1e6 * o.rate_sd:.1f} µs a second, which is put right'
         elif math.isfinite(o.rate_sd):
@@ -118,8 +120,8 @@ class JoinedTables(NamedTuple):
         found = 'as given' if o.given else f'± {o.sd:.5f} s at {o.at:.1f} s, by the motion; {rates}'
         return [
             f'{self.second}: its clock shows {abs(o.seconds):.5f} s {way} than that of {self.first}, {found}',
-            f'each sample is a reading of both, {1e3 * self.apart:.3f} ms apart (rms); {self.lost} are lost, without a '
-            'reading of the other that is near',
+            f'each sample is a reading of both, {1e3 * self.apart:.3f} ms apart (rms; {1e3 * self.most:.3f} ms at '
+            f'most); {self.lost} are lost, without a reading of the other that is near',
         ]
 
     def tree(self) -> dict[str, object]:
@@ -127,7 +129,7 @@ class JoinedTables(NamedTuple):
         o = self.offset
         rate_sd = o.rate_sd if math.isfinite(o.rate_sd) else None
         found = {'offset': o.seconds, 'offset_sd': o.sd, 'at': o.at, 'rate': o.rate, 'rate_sd': rate_sd}
-        return {**found, 'given': o.given, 'lost': self.lost, 'apart': self.apart}
+        return {**found, 'given': o.given, 'lost': self.lost, 'apart': self.apart, 'most': self.most}
 
 
 def join(first: str | Path, second: str | Path, offset: float | None = None) -> JoinedTables:
@@ -164,6 +166,7 @@ def join(first: str | Path, second: str | Path, offset: float | None = None) -> 
         clock,
         int(at[-1] - at[0]) + 1 - len(at),
         float(np.sqrt(np.mean((slower.t[at] - other.t[of]) ** 2))),
+        WITHIN * other.period,
     )
 
 
@@ -196,8 +199,9 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
         unknown = REPEATS if sure else tried[-1][1].unknown
     else:
         raise RecordingError(
-            f'{first}, {second}: {unknown}: this does not tell how far the two clocks are apart. Push the link a few '
-            'times, irregularly, while both record; or say what the second clock shows more: --offset SECONDS'
+            f'{first}, {second}: {unknown}: this does not tell how far the two clocks are apart. Push the link in '
+            'two directions, each time otherwise, while both record; or say what the second clock shows more: '
+            '--offset SECONDS'
         )
     clock = ClockOffset(sure[0].seconds, sure[0].sd, 0.5 * (begin + end))
     edges = np.linspace(ours.t[0], ours.t[-1], min(MOST_PIECES, int(np.ptp(ours.t) / PIECE_S)) + 1)
@@ -205,7 +209,7 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
         found = []
         for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             middle = 0.5 * (begin + end)
-            piece = _shift(ours, theirs, begin, end, clock, NEAR_S + DRIFT * abs(middle - clock.at))
+            piece = _shift(ours, theirs, begin, end, clock, NEAR_S + DRIFT * abs(middle - clock.at), beyond=False)
             if not piece.unknown:
                 found.append((middle, piece.seconds, piece.sd))
         if len(found) < 2:
@@ -216,16 +220,27 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
 
 
 def _shift(
-    ours: LoggerTable, theirs: LoggerTable, begin: float, end: float, clock: ClockOffset, reach: float
+    ours: LoggerTable,
+    theirs: LoggerTable,
+    begin: float,
+    end: float,
+    clock: ClockOffset,
+    reach: float,
+    *,
+    beyond: bool = True,
 ) -> TimeShift:
-    """What the second clock shows more than ``clock`` says, from the motion from ``begin`` to ``end`` of the first."""
+    """What the second clock shows more than ``clock`` says, from the motion from ``begin`` to ``end`` of the first.
+
+    ``beyond``: as :func:`time_shift` has it.
+    """
     grid = np.arange(begin, end, min(ours.period, theirs.period))
-    found = time_shift(ours.at(grid), theirs.at(clock.on_second(grid)), float(grid[1] - grid[0]), reach)
+    first, second = ours.at(grid), theirs.at(clock.on_second(grid))
+    found = time_shift(first, second, float(grid[1] - grid[0]), reach, beyond=beyond)
     if found.unknown or reach < NEAR_S:
         return found
     # What is left is no part of a sample, which the interpolation would bias.
     nearer = clock._replace(seconds=clock.seconds + found.seconds)
-    near = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S)
+    near = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S, beyond=False)
     return near if near.unknown else near._replace(seconds=found.seconds + near.seconds)
 
 

@@ -24,6 +24,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.base.text import json_text
 from psd_deflection.measure.watch import Alarm
+from psd_deflection.recordings.recording import EPOCH_FROM_NS
 
 COMMAND_S = 10.0
 """Seconds after which a command is ended, with what it started."""
@@ -38,14 +39,15 @@ LONGEST_FILE = 4096
 
 
 def finding(alarm: Alarm, about: Mapping[str, object]) -> dict[str, object]:
-    """What is handed on: times in UTC, the shift and its standard deviation in m, or in rad for ``theta``.
+    """What is handed on: times in UTC (s if the clock counts from 0), the shift and its standard deviation in m, or in
+    rad for ``theta``.
 
     ``about``: where it was seen.
     """
     return {
-        'text': f'since {_utc(alarm.since_ns)}: {alarm.words}',
-        'since': _utc(alarm.since_ns),
-        'sure_since': _utc(alarm.observed_ns),
+        'text': f'since {_when(alarm.since_ns)}: {alarm.words}',
+        'since': _when(alarm.since_ns),
+        'sure_since': _when(alarm.observed_ns),
         'channel': alarm.channel,
         'shift': alarm.shift,
         'sd': alarm.sd,
@@ -210,7 +212,9 @@ def _post(address: str, text: bytes, ending: threading.Event) -> None:
             raise _NotForwardedError(why)
 
 
-def _utc(t_ns: int) -> str:
-    """Time in UTC as ISO 8601 has it, to ms."""
+def _when(t_ns: int) -> str:
+    """Time in UTC as ISO 8601 has it, to ms; ``3.489 s`` on a clock that does not count from 1970."""
+    if t_ns < EPOCH_FROM_NS:
+        return f'{t_ns / 1e9:.3f} s'
     s, rest = divmod(t_ns, 1_000_000_000)
     return datetime.fromtimestamp(s, UTC).strftime('%Y-%m-%dT%H:%M:%S') + f'.{rest // 1_000_000:03d}Z'

@@ -72,6 +72,11 @@ def shared_memory_left() -> int:
     return system.f_bavail * system.f_frsize
 
 
+def of_systemd() -> bool:
+    """Whether this is the process of a unit of ``Type=notify``."""
+    return bool(os.environ.get('NOTIFY_SOCKET'))
+
+
 class Watchdog:
     """Tells systemd that the daemon is ready and alive (sd_notify(3)).
 

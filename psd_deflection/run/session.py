@@ -12,7 +12,7 @@ from pathlib import Path
 
 from msg_adapters import ACCELERATION, LOAD, MARK, TOPIC_TYPES, accel_stamped, from_fields, string, to_messages
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
-from psd_deflection.base.errors import RecordingError, SamplesDroppedError
+from psd_deflection.base.errors import ConfigError, RecordingError, SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING, LogCallback
 from psd_deflection.base.text import sanitize
 from psd_deflection.measure.pipeline import Pipeline
@@ -25,7 +25,7 @@ from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.processing import Processing, RecordSink
 from psd_deflection.run.rate_limited_log import RateLimitedLog
-from psd_deflection.run.realtime import lock_memory
+from psd_deflection.run.realtime import lock_memory, of_systemd
 from psd_deflection.run.recorder import Recorder
 from psd_deflection.run.session_texts import RETAKE_ZERO, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
@@ -87,6 +87,11 @@ class Session:
         # The geometry first: a rig that cannot be solved must not open a port.
         pipeline = Pipeline(rig)
         if simulates(rig.values):
+            if of_systemd() and not rig.acquisition.demo:
+                raise ConfigError(
+                    'port: names no device, and a service that records a simulated rig would go unnoticed: set port in '
+                    'the rig file (demo: true starts the simulated rig all the same)'
+                )
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import yaml
 
-from psd_deflection.base.drawings import Drawing, in_page
+from psd_deflection.base.drawings import Drawing, in_page, plotted
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import replace_file
 from psd_deflection.base.pages import page, table
@@ -41,7 +41,7 @@ Notify = Callable[[str], None]
 """Takes a warning."""
 
 GIVEN_RIG = 'the rig that was given'
-NOMINAL_RIG = 'the nominal rig: there is none in'
+OF_THE_THESIS = 'the rig of the thesis: there is none in'
 LONGEST_REPR = 2000
 
 
@@ -115,15 +115,13 @@ class StudyResult(abc.ABC):
     def plot(self, number: int = 0) -> ShownFigure:
         """Return the drawing ``number`` of :meth:`drawings` as a matplotlib figure, which a notebook shows.
 
-        ``figure.savefig('a.png')`` writes it. Raises ConfigError if there is no such drawing.
+        ``figure.savefig('a.png')`` writes it. Raises ConfigError if there is no such drawing, or no matplotlib.
         """
-        from psd_deflection.base.figures import figure_of
-
         shown = self.drawings()
         if not 0 <= number < len(shown):
             there = '; '.join(f'{i}: {drawn.words}' for i, drawn in enumerate(shown)) or 'none, for nothing was found'
             raise ConfigError(f'number: {number}: no such drawing; there are {there}')
-        return figure_of(shown[number])
+        return plotted(shown[number])
 
     def to_pandas(self) -> pandas.DataFrame:
         """:meth:`table` as a DataFrame; ``.attrs['units']`` has the units.
@@ -176,7 +174,7 @@ class Opened(NamedTuple):
         elif self.given:
             rig = GIVEN_RIG
         else:
-            rig = 'the parameters in the recording' if self.recording.parameters else f'{NOMINAL_RIG} the recording'
+            rig = 'the parameters in the recording' if self.recording.parameters else f'{OF_THE_THESIS} the recording'
         return {'recording': str(self.recording.path), 'rig': rig}
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import psd_deflection
 from psd_deflection.base.axes import ranges
 from psd_deflection.base.charts import BUCKETS, Chart, Panel, Rule, Series, drawn
 from psd_deflection.base.errors import ConfigError
@@ -20,6 +21,7 @@ from psd_deflection.base.figures import figure_of
 from psd_deflection.base.pages import page, table
 from psd_deflection.base.tables import Column, Table, columns_of, html_table, text_column
 from psd_deflection.records import FloatArray
+from tools.program import ROOT
 
 
 def reported(chart: Chart) -> dict[str, Any]:
@@ -180,6 +182,14 @@ def test_xarray_has_the_units() -> None:
     assert data['b'].attrs['units'] == '1'
     assert data['t'].attrs == {'units': 's', 'long_name': 'time'}
     assert data.attrs == {'path': 'somewhere'}
+
+
+def test_a_plot_without_matplotlib_names_the_line_of_pip(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'psd_deflection.base.figures', None)
+    recording = psd_deflection.open(ROOT / 'bags/clean')
+    for shown in (recording, psd_deflection.replay(recording), psd_deflection.budget()):
+        with pytest.raises(ConfigError, match=r"plot\(\) needs matplotlib: `pip install 'psd_deflection\[plot\]'`"):
+            shown.plot()
 
 
 @pytest.mark.parametrize('name', ['pandas', 'xarray'])

@@ -18,6 +18,7 @@ from psd_deflection.cli.recordings.plot import Drawn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
+from psd_deflection.recordings.summary import summary
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, FloatArray, ParameterChange, SampleBlock
 from psd_deflection.rig.config import load_rig
@@ -89,11 +90,29 @@ def test_info_of_what_has_no_samples(tmp_path: Path, capsys: pytest.CaptureFixtu
     BagWriter(tmp_path / 'empty', rig_values={}).close()
     assert main(['info', str(tmp_path / 'empty')]) == 0
     text = capsys.readouterr().out
-    parts = ('samples      none', 'lacks        samples (/psd/samples)', ' parameters: the nominal')
+    parts = ('samples      none', 'lacks        samples (/psd/samples)', ' parameters: the rig of the thesis')
     for part in (*parts, 'what the device says of itself', ' known loads'):
         assert part in text
     assert main(['info', str(tmp_path / 'empty'), '--json']) == 0
     assert len(json.loads(capsys.readouterr().out)['lacks']) == 5
+
+
+def test_times_of_marks_and_changes_count_from_the_start(
+    bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def part(*given: Any) -> dict[str, Any]:
+        """As of a part that begins within the block of its mark."""
+        found = summary(*given)
+        moved = {'t_ns': found['start_ns'] + 40_000_000, 'block': 200, 'values': {'state.a': 1.0}}
+        before = {'t_ns': found['start_ns'] - 1, 'block': 190, 'values': {'psd_1.noise': 0.1}}
+        return {**found, 'marks': [{'t_s': -1e-5, 'text': 'on'}], 'changes': [before, moved]}
+
+    monkeypatch.setattr('psd_deflection.cli.recordings.info.summary', part)
+    assert main(['info', str(bag)]) == 0
+    text = capsys.readouterr().out
+    assert 'marks            0.000 s  on' in text
+    assert '  at the start: psd_1.noise = 0.1\n' in text
+    assert 'from 0.040 s on: 1 values that the estimator remembered, for a replay' in text
 
 
 def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(

@@ -69,6 +69,29 @@ def make_targets() -> set[str]:
     return set((ROOT / 'Makefile').read_text().partition('\n.PHONY: ')[2].partition('\n')[0].split())
 
 
+def test_make_keeps_no_half_made_environment(tmp_path: Path) -> None:
+    """As of a Debian without python3-venv."""
+    venv, python = tmp_path / 'venv', tmp_path / 'python'
+    python.write_text(
+        f'#!/bin/sh\ntest "$1" = -c && exit 0\necho "$@"\nmkdir -p {venv}/bin\ntouch {venv}/pyvenv.cfg\nexit 1\n'
+    )
+    python.chmod(0o755)
+    make = ('make', f'PYTHON={python}', f'VENV={venv}', 'UV=', f'{venv}/.requirements')
+    for words in ('-m venv', '-m venv --clear'):
+        done = run(make)
+        assert (done.returncode, venv.exists()) == (2, False)
+        assert f'{words} {venv}\n' in re.sub(' +', ' ', done.stdout)
+        # One that an older make kept.
+        (venv / 'bin').mkdir(parents=True)
+        (venv / 'pyvenv.cfg').touch()
+        (venv / 'bin/python').symlink_to(shutil.which('false') or '')
+
+
+def test_tools_are_typed_as_modules() -> None:
+    """As files they do not find their neighbours."""
+    assert [c for c in ALL if re.match(r'python3? (bench|blind|tools)/', c.line)] == []
+
+
 def test_make_has_few_targets_and_help_names_each() -> None:
     head = (ROOT / 'Makefile').read_text().partition('\nPYTHON ')[0]
     assert len(make_targets()) <= 22

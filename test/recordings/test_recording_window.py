@@ -491,7 +491,7 @@ def test_estimates_have_duration_columns_and_times_of_day() -> None:
     ('recording', 'rig', 'words'),
     [
         ('bag', None, 'the parameters in the recording'),
-        ('csv', None, 'the nominal rig: there is none in the recording'),
+        ('csv', None, 'the rig of the thesis: there is none in the recording'),
         ('csv', 'file', str(ROOT / 'config' / 'thesis_rig.yaml')),
         ('csv', 'object', 'the rig that was given'),
     ],

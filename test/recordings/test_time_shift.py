@@ -111,6 +111,23 @@ def test_each_joined_sample_is_a_reading_of_both(tmp_path: Path, every: int, off
         assert {tuple(row) for row in found[names].tolist()} <= rows
 
 
+@pytest.mark.parametrize('ppm', [0, 40, 100, -200])
+@pytest.mark.parametrize('second', ['5,0,0;0,-8,0;0,0,1;-6,3,0;2,-12,0.5', '20,0,0;0,-20,0;0,0,2;10,-10,0;5,5,1'])
+def test_six_unlike_loads_tell_offset_and_rate(tmp_path: Path, second: str, ppm: int) -> None:
+    """A step every 3 s: the halves of such a motion look alike to one combination of the readings, not to both."""
+    table, rows = volts(f'steps:0,0,0;{second};0,0,0:3'), np.arange(2000, 18000)
+    t = np.arange(len(table)) * 1e-3
+    paths = []
+    for psd, times, of in ((1, t, table), (2, 1.3 + (1.0 + 1e-6 * ppm) * t[rows], table[rows])):
+        readings = of[:, 3 * psd - 3 : 3 * psd]
+        lines = [f'{a:.6f},{x},{y},{light}' for a, (x, y, light) in zip(times, readings, strict=True)]
+        paths.append(tmp_path / f'{psd}.csv')
+        paths[-1].write_text('\n'.join([f't,x{psd},y{psd},sum{psd}', *lines]))
+    clock = join(paths[0], paths[1]).offset
+    when = t[rows].astype(np.float64)
+    assert abs(clock.on_second(when) - 1.3 - (1.0 + 1e-6 * ppm) * when).max() < 5e-5
+
+
 def test_convert_joins_two_loggers_and_says_how(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = map(str, loggers(tmp_path, 10, -1.73))
     assert main(['convert', first, second, '--out', str(tmp_path / 'run.csv')]) == 0
@@ -126,7 +143,7 @@ def test_two_loggers_that_cannot_be_joined_are_refused(tmp_path: Path, capsys: p
     first, second = loggers(tmp_path, 10, 0.0)
     rest = np.arange(3000)
     still = write_table(tmp_path / 'still.csv', np.linspace(0.0, 30.0, 3000), rest % 2, 2)
-    with pytest.raises(RecordingError, match=f'{AT_REST}.*irregularly.*--offset'):
+    with pytest.raises(RecordingError, match=f'{AT_REST}.*two directions.*--offset'):
         join(first, still)
     with pytest.raises(RecordingError, match='have x, y and sum of each PSD once'):
         join(first, first)

@@ -3,6 +3,7 @@
 """Alarms handed on: a real program and a real web server on this machine."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import shlex
@@ -104,6 +105,8 @@ def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Se
     assert expected['since'] == '2023-11-14T22:13:20.250Z'
     assert (expected['channel'], expected['shift'], expected['unit']) == ('x1', 5e-6, 'm')
     assert expected['text'] == f'since 2023-11-14T22:13:20.250Z: {ALARM.words}'
+    # Of a CSV that counts from 0.
+    assert finding(dataclasses.replace(ALARM, since_ns=3_489_000_000), {})['since'] == '3.489 s'
 
 
 def test_no_shell_reads_the_command(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def run(device: ScriptedHost, rig: Rig) -> Iterator[Run]:
 
 
 def test_the_diagnostics_name_the_port_and_no_line_speed(run: Run, device: ScriptedHost) -> None:
-    assert run.acquisition.source.describe()['source'] == f'contract frames on {device.port}'
+    assert run.acquisition.source.describe()['source'] == f'binary frames on {device.port}'
 
 
 class Sender:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import psd_deflection
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.link import LinkStatics
@@ -116,3 +117,9 @@ def test_only_the_last_minute_is_kept() -> None:
         recent.put(SpotMeans(index * period_ns, index, dots, (5.0, 5.0), np.zeros((4, 4)), 20, 0, BlockStatus.OK, ''))
     assert REACH_S / 0.02 < 4_000
     assert recent.step_ns() is None
+
+
+def test_a_service_without_a_port_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('NOTIFY_SOCKET', '/nowhere/notify')
+    with pytest.raises(ConfigError, match=r'^port: names no device.* set port in the rig file'):
+        running()

@@ -15,7 +15,7 @@ estimates, dots, loads and losses with a layout, and cannot be read back.
 
 Two CSVs are those of two loggers, each with some of the PSDs (t,x1,y1,sum1 and t,x2,y2,sum2) and a clock of its own.
 The time between the clocks is found from the motion. The recording is on the first clock; each of its samples is a
-reading of both, the nearest within half a period; without one the sample is lost. Loads are those of the first.
+reading of both, the nearest within 3/4 of a period; without one the sample is lost. Loads are those of the first.
 """
 
 import argparse

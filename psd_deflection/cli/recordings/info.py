@@ -148,7 +148,7 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     out += _lines_of_origin(found)
     out += _lines_of_samples(found)
     out += [
-        _row_of('marks' if i == 0 else '', f'{mark["t_s"]:9.3f} s  {mark["text"]}')
+        _row_of('marks' if i == 0 else '', f'{round(mark["t_s"], 3) + 0.0:9.3f} s  {mark["text"]}')
         for i, mark in enumerate(found['marks'])
     ]
     out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
@@ -239,6 +239,9 @@ def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
     # What the pipeline remembered at the start is for a replay, and for --json.
     for c in found['changes']:
         values = {k: v for k, v in c['values'].items() if not k.startswith('state.')}
-        reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or f'{len(c["values"])} values of the state'
-        out.append(f'  from block {c["block"]} on: {reported}')
+        remembered = f'{len(c["values"])} values that the estimator remembered, for a replay'
+        reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or remembered
+        # Of a part the first ones are older than its start.
+        since = (c['t_ns'] - found['start_ns']) / 1e9
+        out.append(f'  {f"from {since:.3f} s on" if since >= 0.0005 else "at the start"}: {reported}')
     return out

@@ -12,6 +12,7 @@ import numpy as np
 
 from msg_adapters import DEFLECTION
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import Note
 from psd_deflection.measure.averaging import AT_ONCE
 from psd_deflection.measure.estimation import ZERO_VARIANCES
 from psd_deflection.measure.pipeline import Pipeline, zero_variances
@@ -22,7 +23,7 @@ from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.spans import FULL, Span
-from psd_deflection.recordings.summary import NO_PARAMETERS
+from psd_deflection.recordings.summary import THESIS_RIG
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
@@ -71,10 +72,11 @@ def zero_variances_at_end(recording: Recording, rig: Rig) -> tuple[float, ...]:
 
 
 def warnings_about_rig(recording: Recording, params_file: str | None = None) -> list[str]:
-    """The warning that the nominal rig is taken, if neither ``params_file`` nor the recording gives another."""
+    """The note that the rig of the thesis is taken, if neither ``params_file`` nor the recording gives another."""
     if recording.parameters or params_file is not None:
         return []
-    return [f'{recording.path}: lacks {NO_PARAMETERS}']
+    holds = 'a CSV holds' if recording.path.suffix == '.csv' else 'it holds'
+    return [Note(f'{recording.path}: {holds} no parameters: {THESIS_RIG}')]
 
 
 def open_for_replay(

@@ -431,7 +431,8 @@ _NEEDS = {
 MOTIONS = tuple(dict.fromkeys(_NEEDS.values()))
 """What determines parameters, the easiest first."""
 ROTATED = (
-    'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
+    'nothing to do: a turned PSD and one whose axes are not at right angles read alike; what both add up to is known, '
+    'and the estimates need no more'
 )
 
 

@@ -88,6 +88,8 @@ def progress_of(calibration: Calibration) -> CalibrationProgress:
             for name in [part for part in direction.parts if part not in known] or [*direction.parts][:1]:
                 motions.setdefault(needs_of([name]), []).append(name)
     needs = [Need(motion, tuple(dict.fromkeys(names))) for motion, names in motions.items()]
+    # What is in a need is not determined: the two add up to all.
+    known -= {name for need in needs for name in need.names}
     return CalibrationProgress(
         kind=calibration.kind,
         seconds=float(sum(run.t[-1] - run.t[0] for run in calibration.runs)),

@@ -63,7 +63,7 @@ class Calibrated(StudyResult):
             f'undetermined: {", ".join(n.names)}; needed: {n.motion}' for n in progress_of(calibration).needs
         ]
         if any(d.needs == ROTATED for d in calibration.undetermined):
-            statements.append(ROTATED.partition(': ')[2])
+            statements.append(f'rotation and crosstalk: {ROTATED}')
         return statements
 
     def tree(self) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def sentence(calibration: Calibration) -> str:
     if calibration.rejected:
         return f'Rejected: {calibration.rejected}.'
     g = calibration.gap
-    known = int(sum(calibration.fit.free[i] for i in REPORTED))
+    known = progress_of(calibration).determined
     what = {'reference': 'the reference', 'loads': 'the known loads', 'self': 'the redundant reading'}[calibration.kind]
     return (
         f'{known} of {len(REPORTED)} parameters are determined by {what}; on motion that was not fitted the readings '

@@ -293,7 +293,7 @@ class RigConclusion(Conclusion):
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
         first, *remaining_lines = super().lines()
-        out = [first, *self.late, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
+        out = [first, *self.late, *(f'set-up: {f"{f.name} {_place(f)}".strip()}: {f.fix}' for f in self.setup)]
         numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
         out += [f'rig file: {line(key, self.values[key])}' for key in numbers]
         for e in self.effects:
@@ -403,10 +403,15 @@ def _setup(discovery: RigConclusion) -> str:
     """What is wrong with the set-up, in a sentence, or nothing."""
     where: dict[str, dict[str, None]] = {}
     for f in discovery.setup:
-        place = '' if f.where == ' '.join(LOADS) else f.where
-        where.setdefault(f.name.replace('_', ' '), {})[', '.join(filter(None, (place, _seconds(f))))] = None
-    names = [f'{name} ({"; ".join(places)})' for name, places in where.items()]
+        place = ', '.join(filter(None, (_place(f), _seconds(f))))
+        where.setdefault(f.name.replace('_', ' '), {}).update({place: None} if place else {})
+    names = [f'{name} ({"; ".join(places)})' if places else name for name, places in where.items()]
     return f'The set-up is not as the rig file or the recording says: {", ".join(names)}.' if names else ''
+
+
+def _place(finding: Finding) -> str:
+    """Where a mistake is; '' if it is in all loads."""
+    return '' if finding.where == ' '.join(LOADS) else finding.where
 
 
 def _seconds(finding: Finding) -> str:
@@ -450,6 +455,7 @@ def law_sentence(discovery: RigConclusion) -> str:
 
 
 def _missing(discovery: Conclusion, besides: str = '') -> str:
+    """What is missing, in a sentence. ``besides``: a word if the set-up was wrong too."""
     ws, residual = discovery.workspace, _residual_words(discovery)
     before = f'{ws.display_scale[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
@@ -471,17 +477,17 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     named = ' and '.join(parts)
     if discovery.verdict == 'effects_found':
         is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
-        return (
-            f'{named} {is_are} missing from the model; adding {them} closes the gap '
-            f'from {before} to {residual}.{fitted}'
-        )
+        # The gap is that before both: nobody can say what share of it each closes.
+        way = f'adding {them} and putting the set-up right together close' if besides else f'adding {them} closes'
+        return f'{named} {is_are} missing from the model{besides}; {way} the gap from {before} to {residual}.{fitted}'
+    named += ' and the set-up put right' if besides and named else ''
     if not any(u.unexplained for u in discovery.unknown):
         return (
             f'{named} close the gap from {before} to {residual}, but their sizes '
             f'are tied: one effect that is not in the catalogue is likelier.'
         )
     if named:
-        explains = 'explains' if len(parts) == 1 else 'explain'
+        explains = 'explains' if len(parts) == 1 and not besides else 'explain'
         return (
             f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
             f'{ws.display_scale[1]} to {residual}.{fitted}'

@@ -127,7 +127,7 @@ class DiscoverOptions:
     ) -> Discovery:
         """Return the answer; ``notify`` gets a warning if the rig file cannot be edited."""
         discovery = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
-        source = GIVEN_RIG if self.known else 'the parameters in each recording, the nominal rig if it has none'
+        source = GIVEN_RIG if self.known else 'the parameters in each recording, the rig of the thesis if it has none'
         return replace(discovery, params_file=self.params_file, notify=notify, rig_source=source)
 
     def discovered_in_tables(self, tables: Sequence[Any], notify: Notify = warn_caller) -> StudyResult:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.log import Note
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import (
     IN_MILLIMETRES,
@@ -20,6 +21,7 @@ from psd_deflection.recordings.read.references import (
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import rig_at_end, warnings_about_rig
 from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN, digest_of
+from psd_deflection.recordings.summary import THESIS_RIG
 from psd_deflection.records import dot_channels
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -116,7 +118,7 @@ def read_tables(
         name = source_of_kind.path if isinstance(source_of_kind, Recording) else source_of_kind
         raise RecordingError(f'{name}: is no table of readings, but others are: search them one by one')
     if rig is None and None in alone:
-        warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')
+        warn(Note(f'a table of readings holds no parameters: {THESIS_RIG}'))
     return [
         read_readings(Path(str(source)), rig, overrides, where, warn)
         if recording is None

@@ -291,9 +291,9 @@ def finding_of_effect(
         )
         return [Finding(name, f'psd_{int(v["psd"])}', 1e-6 * v['time_us'], words, evidence)], {}
     if name == 'load_delay':
-        direction = 'late' if v['late_by'] > 0.0 else 'early'
-        late = v['late_by']
-        words = f'the recorded load times are {abs(late):.4g} s {direction}: subtract {late:.4g} s from them'
+        size = f'{abs(v["late_by"]):.4g} s'
+        direction, way = ('late', f'subtract {size} from') if v['late_by'] > 0.0 else ('early', f'add {size} to')
+        words = f'the recorded load times are {size} {direction}: {way} them'
         return [Finding(name, ' '.join(LOADS), v['late_by'], words, evidence)], {}
     if name == 'zero':
         o = workspace.observations[int(v['recording']) - 1]

@@ -435,7 +435,10 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
     for progress in (along_x, all_round):
         assert ROTATED not in [need.motion for need in progress.needs]
         for p in progress.parameters:
-            assert p.determined == (p.left <= OPEN)
+            assert p.left <= OPEN or not p.determined
+        assert {p.name for p in progress.parameters if not p.determined} == {
+            n for need in progress.needs for n in need.names
+        }
     of_motion = {need.motion: need.names for need in along_x.needs}
     gains = 'a motion of the dot along that axis, by forces along X and Y and a torque'
     assert 'psd_1.gain_y' in of_motion[gains]

@@ -156,10 +156,10 @@ def test_a_mistake_is_reported_with_its_line(workspace: Workspace) -> None:
     for several in (workspace, Workspace(workspace.observations[:1])):
         _, lines = finding_of_effect(several, fit, 0, 33.0)
         assert lines == {'amplifier.sensitivity': 1.5 * RIG.amplifier.sensitivity}
-    for late, word in ((0.04, 'late'), (-0.04, 'early')):
+    for late, word in ((0.04, 'late: subtract 0.04 s from them'), (-0.04, 'early: add 0.04 s to them')):
         finding, lines = words('load_delay', late_by=late)
         assert (finding.where, finding.value, lines) == ('load_fx load_fy load_tz', late, {})
-        assert finding.fix == f'the recorded load times are 0.04 s {word}: subtract {late:g} s from them'
+        assert finding.fix == f'the recorded load times are 0.04 s {word}'
     finding, lines = words('jump', recording=2.0, psd=1.0, time_us=2_500_000.0, jump_x=3e-6, jump_y=-4e-6)
     assert (finding.where, finding.value, lines) == ('psd_1', 2.5, {})
     assert finding.fix.startswith('PSD 1 of second jumps by 3 µm along x and -4 µm along y')
@@ -743,6 +743,17 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
         'The set-up is not as the rig file or the recording says: channel sign (y1). '
         f'Nothing is missing besides: the gap is {left}.'
     )
+    late = Finding('load_delay', 'load_fx load_fy load_tz', 0.4, 'subtract')
+    assert sentence(setup=(late,)) == (
+        'The set-up is not as the rig file or the recording says: load delay (0.4 s late). '
+        'sensor_rotation (psd 2) is missing from the model besides; adding it and putting the set-up right together '
+        f'close the gap from {before} to {left}. Fitted: sensor_rotation {trees.size_of(named)}.'
+    )
+    unannotated = Finding('load_coverage', late.where, 0.5, 'note it')
+    partly = {'verdict': 'unknown_effect', 'unknown': (Unknown('', (), 0.5),)}
+    described = sentence(setup=(unannotated,), **partly)
+    assert 'says: load coverage. sensor_rotation (psd 2) and the set-up put right explain part, but' in described
+    assert dataclasses.replace(found, setup=(unannotated,)).lines()[1] == 'set-up: load_coverage: note it'
     tree = dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)).tree()
     assert tree['unknown'] == [{'signature': 's', 'depends_on': ['d'], 'explains': 0.4, 'rms': 2e-6, 'law': None}]
     assert tree['setup'] == [

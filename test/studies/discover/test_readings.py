@@ -69,7 +69,7 @@ def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytes
     table = written(tmp_path / 'hung.csv', 1e3 * read([SOFT]).values)
     assert main(['discover', str(table), '--out', str(tmp_path / 'found')]) == 0
     answer = capsys.readouterr()
-    assert 'the nominal rig is taken; give --params-file' in answer.err
+    assert 'note: a table of readings holds no parameters: the rig of the thesis is taken; --params-file' in answer.err
     assert 'bending_stiffness' in answer.out
     found = json.loads((tmp_path / 'found' / 'result.json').read_text())
     (effect,) = found['effects']

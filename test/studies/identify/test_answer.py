@@ -152,7 +152,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     """A recording for the answer to be of; its samples are not used."""
     path = tmp_path_factory.mktemp('run') / 'run.csv'
     assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:0.1']) == 0
-    with pytest.warns(UserWarning, match='nominal rig'):
+    with pytest.warns(UserWarning, match='rig of the thesis'):
         return opened(path)
 
 
