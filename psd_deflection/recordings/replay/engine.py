@@ -117,7 +117,7 @@ def with_recorded_zero(recording: Recording, rig: Rig, name: str) -> Rig:
     if other:
         recording.warn(f'{recording.path}: its zero is not used: {name} has other {", ".join(other)}')
         return rig
-    recording.warn(f'{recording.path}: its zero is used, since {name} has none')
+    recording.warn(Note(f'{recording.path}: its zero is used, since {name} has none'))
     return replace_values(rig, start.zeros_by_name, str(recording.path))
 
 
