@@ -138,6 +138,10 @@ def test_segments_change_the_noise_of_all_sets() -> None:
         dots, covariance, _, _ = run.block(0)
         assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
         assert len(dots) == count
+    # Dots that fall on one another have no direction in which they could be apart.
+    one_point = (0.0, 0.0, *(rig.centers[0] - rig.centers[1]).tolist())
+    of_two = PsdSet(rig_of(), (0, 1), 'none')
+    assert of_two.unexplained(one_point, (0.0,) * 4, np.eye(4), (0.0,) * 5) is None
     assert not BlockEstimator(rig_of(), False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
 
 

@@ -57,6 +57,10 @@ def test_two_tones_are_two_and_what_does_not_take_part_stays_out() -> None:
     np.testing.assert_allclose(first.covariance, np.outer(TURN[1], TURN[1]) * 9e-6**2 / 2.0, rtol=0.05, atol=1e-20)
     assert words_of((first, second), RATE) == '5.1 µm rms near 180 Hz, 1.7 µm rms near 87 Hz'
     assert words_of((Tone(0.087, np.eye(4) * 200e-12),), RATE) == '14 µm rms near 87 Hz'
+    # What is within a twenty-fifth of the frequency belongs to it: 3 um at 312 Hz, of whose lobe 5/6 are within.
+    wide = noise(1) + (9e-6 * tone(300.0) + 3e-6 * tone(312.0))[:, None] * (1.0, 0.0)
+    strongest = max(found(wide, noise(2)), key=rms_of)
+    assert TURN[0] @ strongest.covariance @ TURN[0] == pytest.approx((81.0 + 9.0 / 1.2) * 0.5e-12, rel=0.015)
 
 
 def test_the_floor_of_a_tone_is_that_about_it() -> None:
