@@ -188,12 +188,13 @@ class ToneSearch:
     def _broad(self, every: npt.NDArray[np.complex128], readings: int, known: Sequence[float]) -> Iterator[slice]:
         """The bins, in runs of groups, in which readings of two PSDs vary together and what cannot move does not.
 
-        ``every``: the spectra, those of ``readings`` first.
+        ``every``: the spectra, those of ``readings`` first. What falls from one group to the next is the flank of
+        slower motion.
         """
         cross = self._together(self._grouped(every))
         own = np.sqrt(np.diagonal(cross, axis1=1, axis2=2)) + _LEAST
         alike = np.abs(cross) / (own[:, :, None] * own[:, None, :])
-        psd = np.arange(readings) // 2
+        level, psd = np.square(own[:, :readings]).sum(axis=1), np.arange(readings) // 2
         coherent = alike[:, :readings, :readings][:, psd[:, None] != psd].max(axis=1)
         still = alike[:, readings:, readings:]
         electric = (still - np.eye(still.shape[1])).max(axis=(1, 2)) > _STILL_COHERENT
@@ -201,7 +202,7 @@ class ToneSearch:
         held = np.isin(np.arange(self._groups), [(round(f * self._length) - self._start) // _GROUP for f in known])
         found = (coherent > np.where(held, _STILL_COHERENT, _COHERENT)) & ~electric & (starts >= self._followed)
         for run in np.split(np.arange(self._groups), np.flatnonzero(np.diff(found)) + 1):
-            if found[run[0]]:
+            if found[run[0]] and level[run].max() > level[run[0] - 1]:
                 yield slice(int(starts[run[0]]), int(starts[run[-1]]) + _GROUP)
 
     def without(self, places: IntArray, dots: FloatArray, frequency: float) -> tuple[FloatArray, Hum]:
