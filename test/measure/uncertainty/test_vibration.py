@@ -186,7 +186,7 @@ def test_slow_motion_steps_and_regular_gaps_make_no_tone() -> None:
     assert not found(noise(1) + slow, noise(2))
     # Every tenth sample lost makes a tone of 100 Hz of any slow motion that is not bridged.
     here = np.flatnonzero(ALL % 10 != 3)
-    ramp = 1e-3 * np.stack((ALL / N, (ALL / N) ** 2), axis=1)
+    ramp = 2e-2 * np.stack((ALL / N, (ALL / N) ** 2), axis=1)
     assert not found((noise(1) + ramp)[here], noise(2)[here], here)
 
 
