@@ -217,11 +217,11 @@ def test_a_detector_is_acquitted_by_what_it_would_show(
     assert ws.first == {c.effect.name for c in machine.screen(ws, None).candidates} | {'load_delay'}
 
 
-def held_for_a_second(noted: FloatArray, more: float) -> Problem:
-    """Loads ``noted`` (8, 3), with ``more`` noise, of that of the rig file; no effect is looked for."""
+def held_for_a_second(annotated: FloatArray, more: float) -> Problem:
+    """``annotated`` loads (8, 3), with ``more`` noise, of that of the rig file; no effect is looked for."""
     volts = read(np.repeat(LEVELS, 1000, axis=0))
     volts += more * RIG.noises.ravel() * np.random.default_rng(1).standard_normal(volts.shape)
-    o = Observation('x', RIG, volts, np.repeat(noted, 1000, axis=0))
+    o = Observation('x', RIG, volts, np.repeat(annotated, 1000, axis=0))
     machine = RecordedRig.of([o], RIG, effect_names(), None, lambda _: None)
     return Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
 
