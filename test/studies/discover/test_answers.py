@@ -192,7 +192,8 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     part = 0.01 * np.random.default_rng(0).standard_normal((6, 300))
     part[4, 120:] += 2.0
     part[3, 120:] -= 1.0
-    fake = cast(Workspace, SimpleNamespace(split=lambda r: [r, r[:, :49]], fine=[4, 4], observations=[o, o]))
+    # Of the same step 49 fine blocks tell nothing.
+    fake = cast(Workspace, SimpleNamespace(split=lambda r: [r, r[:, 96:145]], fine=[4, 4], observations=[o, o]))
     # n1 n2/n (2^2 + 1^2) = 360: beyond 50.
     for size in (1.0, 0.4):
         ((recording, psd, time),) = likely_jumps(fake, size * part)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What hung instead of what was noted, found by a search, and what the fourth reading says."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,15 +18,17 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover import recorded_rig
 from psd_deflection.studies.discover.applied import directions, ringing_on, unseen
-from psd_deflection.studies.discover.discover import discover, effective_loads, refitted
+from psd_deflection.studies.discover.discover import discover, effective_loads, noise_level, refitted
+from psd_deflection.studies.discover.discover import searched as doubted
 from psd_deflection.studies.discover.hidden import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.problem import Problem
-from psd_deflection.studies.discover.recorded_rig import RecordedRig
+from psd_deflection.studies.discover.recorded_rig import RecordedRig, rig_of
 from psd_deflection.studies.discover.redundant import FourthReading, excess, visible
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import SearchResult
+from psd_deflection.studies.discover.search.weighing import Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 from psd_deflection.studies.loads.plateaus import Plateau
@@ -209,3 +212,35 @@ def test_a_detector_is_acquitted_by_what_it_would_show(
     machine = replace(machine, recorded=replace(machine.recorded, fourth=reading))
     monkeypatch.setattr(recorded_rig, 'excess', lambda ws, residual: (2.0 * 3.0 / (0.2 * share * least), 99.0))
     assert bool(rotation(machine.screen(ws, None))) is there
+    # The link and the mistakes of the set-up, which touch every channel, are never acquitted.
+    monkeypatch.setattr(recorded_rig, 'excess', lambda ws, residual: (1e9, 99.0))
+    assert ws.first == {c.effect.name for c in machine.screen(ws, None).candidates} | {'load_delay'}
+
+
+def held_for_a_second(annotated: FloatArray, more: float) -> Problem:
+    """``annotated`` loads (8, 3), with ``more`` noise, of that of the rig file; no effect is looked for."""
+    volts = read(np.repeat(LEVELS, 1000, axis=0))
+    volts += more * RIG.noises.ravel() * np.random.default_rng(1).standard_normal(volts.shape)
+    o = Observation('x', RIG, volts, np.repeat(annotated, 1000, axis=0))
+    machine = RecordedRig.of([o], RIG, effect_names(), None, lambda _: None)
+    return Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(('floors', 'other'), [(9.5, False), (10.5, True)])
+def test_all_loads_are_doubted_from_ten_floors_on(floors: float, other: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = held_for_a_second(LEVELS + OFF, 0.0)
+    gap = problem.comparison.gap(problem.fit.difference)
+    monkeypatch.setattr(Workspace, 'floor', lambda _: gap / floors)
+    monkeypatch.setattr('psd_deflection.studies.discover.discover.SEARCH', ())
+    assert bool(rig_of(doubted(problem)).recorded.wrong) is other
+
+
+def test_noise_is_the_rig_files_unless_steps_or_the_unknown_make_it() -> None:
+    problem = held_for_a_second(LEVELS, 2.0)
+    ((finding),) = noise_level(problem).setup
+    assert finding.name == 'noise_level'
+    assert finding.value == pytest.approx(math.sqrt(5.0), rel=0.05)
+    recorded = replace(rig_of(problem).recorded, value_grid=make_active('quantisation', {'step': 0.01}, 'test'))
+    stepped = replace(rig_of(problem), recorded=recorded)
+    for other in (replace(problem, machine=stepped), replace(problem, unknown=(Unknown('drifts', (), 0.5),))):
+        assert noise_level(other) is other

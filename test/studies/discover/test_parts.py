@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.signal import lfilter
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
@@ -206,13 +207,16 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     assert own.refitted_beside([np.zeros_like(one)], ()) is own
     assert (ws.direction_sd(), ws.refitted(off), ws.refitted_beside(off, ())) == ({}, ws, ws)
     assert ws.with_free((ZeroDirection(0, 1, 1e-6),)).refitted_beside(off, ()).observations[0] is o
+    # Five, of which two make the others: of least norm.
+    sums = np.array([[1.0, 0.0], [0.7, 0.0], [0.0, 1.0], [1.0, 1.0], [-0.7, 1.0]])
+    five = [LoadDirection(0, np.tensordot(s, changes, 1), 1e4, 'hung', k) for k, s in enumerate(sums)]
+    got, want = ws.with_free(five).direction_sd(), np.linalg.norm(np.linalg.pinv(a @ sums.T, rcond=1e-9), axis=1)
+    assert list(got.values()) == pytest.approx(want.tolist(), rel=1e-6)
 
 
 def resting(n: int, level: float, memory: float = 0.0, seed: int = 0) -> FloatArray:
     e = level * np.random.default_rng(seed).standard_normal((n, 6))
-    for i in range(1, n):
-        e[i] += memory * e[i - 1]
-    return e
+    return np.asarray(lfilter([1.0], [1.0, -memory], e, axis=0))
 
 
 @pytest.mark.parametrize(('n', 'known'), [(400, False), (420, True)])
@@ -245,10 +249,9 @@ def test_a_weak_memory_counts_beside_clear_ones(errors: tuple[float, ...], colou
     assert model.coloured == (True,) * coloured + (False,) * (6 - coloured)
 
 
-@pytest.mark.slow
 def test_a_memory_of_noise_is_that_of_its_process() -> None:
     """x = 0.7 x- + e: the deviation of means over 4 and over 20 samples, and how well one block tells the next."""
-    n, memory = 30_000, 0.7
+    n, memory = 15_000, 0.7
     o = Observation('x', RIG, np.zeros((n, 6)), np.zeros((n, 3)))
     rows = resting(n, 1e-3, memory, 3)
     model = estimate_noise(o, rows, 4, np.full(6, 1e-6))

@@ -257,6 +257,9 @@ def test_neighbours_that_follow_each_other_are_fewer_values() -> None:
     assert ws.periods == [0.5] * 3
     ever = [np.ones((2, n)) * np.linspace(0.0, 1.0, n) for _ in range(3)]
     assert (PlantComparison(Pictures(ever, {}, period=0.5)).independent >= 2.0).all()
+    # One value is like the next, which is no noise unless somebody says so.
+    for observed, stated, alike in ((ever, (), True), (ever, (1.0, 1.0), False), (tables(0), (), False)):
+        assert PlantComparison(Pictures(observed, {}, period=0.5, noise=stated)).correlated is alike
     still = [np.ones((2, 2)) for _ in range(3)]
     assert PlantComparison(Pictures(still, {}, period=0.5)).independent.tolist() == [6.0, 6.0]
     pair = Pictures([np.array([[1.0, 2.0], [5.0, 3.0]])], {}, cases=('a',), period=0.5)

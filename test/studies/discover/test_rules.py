@@ -501,6 +501,15 @@ def test_held_out_residual_is_of_fit_without_its_cases() -> None:
     dots = volts * RIG.sensitivities.reshape(4, 1)
     assert heldout_gap(plant, fit) == pytest.approx(float(np.sqrt(np.mean(dots**2))), rel=1e-4)
     assert heldout_gap(plant, null) == plant.gap(null.difference)
+    # What one case alone shows is off for the others if it is a size; a shape stays.
+    once, late = np.eye(FINE)[0] * np.ones((6, 1)), np.eye(FINE)[-1] * np.ones((6, 1))
+    plant = Plant({A: late, ('a', 'y'): once}, without_noise((once, 400.0)))
+    x, y = effect('a', 'x', 'y').parameters
+    for kind in ('amplitude', 'shape'):
+        one = dataclasses.replace(effect('a', 'x'), parameters=(x, dataclasses.replace(y, kind=kind)))
+        fit = refit(plant, [ActiveEffect(one, {'x': 0.0, 'y': 0.0})])
+        want = fit.residual if kind == 'shape' else refit(plant, ()).residual
+        np.testing.assert_allclose(heldout_residual(plant, fit), want, atol=1e-3)
 
 
 def test_the_error_of_an_unseen_gain_is_the_smaller_of_two() -> None:
