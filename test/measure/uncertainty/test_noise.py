@@ -153,6 +153,8 @@ def test_another_one_goes_on_from_the_state_to_the_bit() -> None:
     feed(one, coloured(5 * SEGMENT + 7 * SIZE, 0.3, 18))
     other.set_state(one.state())
     other.set_segment(one.segment())
+    # Of whole segments each lag has all its pairs.
+    np.testing.assert_allclose(one.state()[-SIZE:], 1.0 - np.arange(SIZE) / SEGMENT)
     more = coloured(3 * SEGMENT, 0.3, 19, 1.2 * SIGMA)
     for noise in (one, other):
         feed(noise, more, 5 * SEGMENT_BLOCKS + 7)

@@ -80,6 +80,7 @@ def test_a_tone_lasts_until_it_is_below_twelve_times_the_floor() -> None:
         moving = noise(1) + amplitude * tone(87.0)[:, None]
         assert not found(moving, noise(2))
         assert len(found(moving, noise(2), known=(hz / RATE,))) == kept
+    assert found(noise(1) + 0.55e-6 * tone(498.0)[:, None], noise(2))  # The last bin but one.
     # A strong one elsewhere is found beside it.
     both = noise(1) + 0.33e-6 * tone(87.0)[:, None] + 3e-6 * tone(200.0)[:, None]
     assert [round(t.frequency * RATE) for t in found(both, noise(2), known=(0.087,))] == [200, 87]
