@@ -74,13 +74,14 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
 
 
 def rows_of_two(offset: FloatArray) -> observation.Rows:
-    """Two recordings of one rig; the readings of the second are off by ``offset`` (4,), m."""
+    """Two recordings of one rig; before the second the beams were aimed anew, by ``offset`` (4,), m."""
     rng, n = np.random.default_rng(8), 120
     pose = rng.uniform(-1.0, 1.0, (n, 3)) * (3e-3, 3e-3, 2e-2)
     run = np.repeat([0, 1], n // 2)
-    dots: FloatArray = (
-        misaligned.dots(misaligned.nominal(), pose) + 1e-6 * rng.normal(size=(n, 4)) + run[:, None] * offset
-    )
+    aimed = dict(zip(('beam_1.x', 'beam_1.y', 'beam_2.x', 'beam_2.y'), offset.tolist(), strict=True))
+    dots = np.where(
+        run[:, None], *(misaligned.dots(misaligned.nominal() | beams, pose) for beams in (aimed, {}))
+    ) + 1e-6 * rng.normal(size=(n, 4))
     loads, velocity = rng.uniform(-10.0, 10.0, (n, 3)), rng.normal(size=(n, 3)) * 1e-3
     pose += rng.normal(size=(n, 3)) * (2e-5, 2e-5, 2e-4)
     moved, nothing = np.full((n, 4), 1e-12), np.zeros(n, dtype=bool)
@@ -109,6 +110,10 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind
         inverse = weights[j] * np.linalg.inv(covariance + 1.5**2 * np.diag(rows.variances[j])) / 2.0
         normal += slopes.T @ inverse @ slopes
         right += slopes.T @ inverse @ linear.residual[j]
+    for i in (fitting.CLAMP_AT, fitting.CLAMP_AT + 1, fitting.CLOCK):
+        step = prior.sd[i] * (np.arange(SIZE) == i)
+        less = linear.residual - fitting.linearised(rows, prior.mean + step, rig, kind).residual
+        np.testing.assert_allclose(linear.slopes @ step, less, atol=1e-9 * np.abs(linear.residual).max())
     gain = normal[:SIZE, SIZE:] @ np.linalg.inv(normal[SIZE:, SIZE:])
     size = np.sqrt(np.abs(np.diag(normal[:SIZE, :SIZE]))) + 1e-30
     scale = np.outer(size, size)
@@ -122,8 +127,8 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind
 
 
 def test_two_recordings_have_one_zero_after_the_offset_is_taken_off() -> None:
-    """A zero moves readings under load by nearly as much: what is left is the dots' noise and its mean's."""
-    offset, rig = np.array([4e-5, -3e-5, 2e-5, 5e-5]), rig_from_values({})
+    """As much as a beam may be off. What is left is the dots' noise and its mean's."""
+    offset, rig = np.array([4e-4, -3e-4, 2e-4, 5e-4]), rig_from_values({})
     prior = fitting.prior_of_rig(rig)
     free = np.zeros(SIZE, dtype=bool)
     free[ZERO:COUNT] = True
