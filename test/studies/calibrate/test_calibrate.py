@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration against rigs of the second generator in blind/; dark levels against photocurrents that add."""
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,13 +14,15 @@ from blind import calibration as campaign
 from blind import misaligned
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.model.detector import VoltsToDots
-from psd_deflection.records import FloatArray
+from psd_deflection.recordings.in_memory import RecordingInMemory
+from psd_deflection.records import AppliedLoad, FloatArray, RawChunk
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate import calibrate as module
 from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
 from psd_deflection.studies.calibrate.dark import dark_levels, result_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, prior_of_rig
+from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
 from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows
 from psd_deflection.studies.calibrate.result import values_of
 
@@ -155,6 +159,38 @@ def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     assert found.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
 
 
+def test_a_non_linearity_that_does_not_last_is_dropped(nominal: Rig) -> None:
+    """Of one sign in every second eighth of the recording, of the other in the rest: worse than none on what was left
+    out of a fit."""
+    pose = misaligned.poses(np.tile(misaligned.pushes(np.random.default_rng(4), 6, 0.1), (8, 1)))
+    one, other = (
+        misaligned.record(only(psd_1__nonlinearity=k), pose, np.random.default_rng(1), every=10)
+        for k in (200.0, -200.0)
+    )
+    odd = np.arange(len(pose))[:, None] * 8 // len(pose) % 2 == 1
+    found = calibrate([campaign.run_of(replace(one, volts=np.where(odd, other.volts, one.volts)))], nominal)
+    assert 'psd_1.nonlinearity' in found.dropped
+    assert found.values[AT['psd_1.nonlinearity']] == 0.0
+    # It is known better all the same.
+    assert found.sd[AT['psd_1.nonlinearity']] < 0.5 * found.prior.sd[AT['psd_1.nonlinearity']]
+
+
+def test_a_recording_is_taken_with_its_rig_and_the_load_of_each_sample(tmp_path: Path) -> None:
+    """A load that is noted a fifth of a sample late counts for that sample, one that is a third late for the next."""
+    rig = rig_from_values({'link.length': 0.6})
+    t_ns = 10**9 + 10**6 * np.arange(80)
+    samples = RawChunk(np.arange(80), t_ns, np.full((80, 6), 5.0, dtype=np.float32), np.zeros(80, dtype=np.uint8))
+    noted = [AppliedLoad(10**9 + ns, fx, 0.0, 0.0) for ns, fx in ((20_200_000, 10.0), (60_333_000, 20.0))]
+    recording = RecordingInMemory(tmp_path, None, samples, noted)
+    recording.parameters = rig.flat()
+    options = CalibrationOptions()
+    assert options.rig([recording], pytest.fail).flat() == rig.flat()
+    (run,) = options.runs([recording], rig)
+    assert run.loads is not None
+    assert run.loads[:, 0].tolist() == [0.0] * 20 + [10.0] * 41 + [20.0] * 19
+    assert (len(run.reference_t), len(run.reference)) == (0, 0)
+
+
 def test_a_reference_that_is_no_reference_is_rejected(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
     wrong = CalibrationRun(
@@ -198,6 +234,16 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     assert relative == pytest.approx(0.02, abs=0.006)
     # Common to all gains, against the clamp: no better than the tolerance of four of them.
     assert found.sd[AT['psd_1.gain_x']] > 0.003
+
+
+def test_a_check_reports_where_the_beams_are_from_the_zero_of_the_file(nominal: Rig) -> None:
+    pose = misaligned.poses(misaligned.pushes(np.random.default_rng(3), 3, 0.5))
+    truth = only(beam_1__x=1.2e-3, beam_1__y=-2.1e-3, beam_2__x=2e-4)
+    rig = replace_values(nominal, {'psd_1.zero': [1e-3, -2e-3], 'psd_2.zero': [3e-4, 1e-4]})
+    found = check([campaign.run_of(misaligned.record(truth, pose, np.random.default_rng(1)))], rig)
+    assert found.unchanged
+    assert np.abs(found.zero - (2e-4, -1e-4, -1e-4, -1e-4)).max() < 2e-5
+    assert np.all(np.abs(found.zero - (2e-4, -1e-4, -1e-4, -1e-4)) < 4.0 * found.zero_sd)
 
 
 @pytest.mark.slow
@@ -264,11 +310,20 @@ def test_levels_are_within_what_is_reported_of_them_in_95_of_100(nominal: Rig) -
     assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
 
 
-def test_the_error_of_twenty_pieces_is_students(nominal: Rig) -> None:
-    """Means that alternate by 1 mV, so that none follows from the one before."""
-    volts = np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + np.repeat(1e-3 * (-1.0) ** np.arange(20), 250)[:, None]
+@pytest.mark.parametrize(
+    ('means', 'worth'),
+    [
+        # None follows from the one before.
+        ([1, -1] * 10, 20.0),
+        # Of neighbours 17 are alike and 2 are not: a correlation of 15/20, (1 + 3/4)/(1 - 3/4) are worth one.
+        ([*[1] * 5, *[-1] * 10, *[1] * 5], 20.0 / 7.0),
+    ],
+)
+def test_the_error_of_twenty_pieces_is_students(nominal: Rig, means: list[int], worth: float) -> None:
+    """Means that differ by 1 mV from their mean."""
+    volts = np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + np.repeat(1e-3 * np.array(means), 250)[:, None]
     (one, _) = dark_levels([run_of(volts)], nominal)
-    assert one.sd == pytest.approx(np.full(3, 2.093024 / 1.959964 * 1e-3 / 19**0.5), rel=1e-5)
+    assert one.sd == pytest.approx(np.full(3, 2.093024 / 1.959964 * (1e-6 * 20 / 19 / worth) ** 0.5), rel=1e-5)
 
 
 def test_the_error_of_white_noise_is_that_of_a_mean(nominal: Rig) -> None:

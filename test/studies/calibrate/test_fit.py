@@ -9,15 +9,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.linalg import block_diag
+from scipy.stats import chi2, multivariate_normal
 
 import psd_deflection
 from blind import misaligned
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import COUNT, INDEX, PARAMETERS, TOLERANCES, ZERO
-from psd_deflection.model.misalignment.rig import vector_of_rig
+from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import rig_from_values
+from psd_deflection.rig.config import replace_values, rig_from_values
 from psd_deflection.studies.calibrate import check as checking
 from psd_deflection.studies.calibrate import fit as fitting
 from psd_deflection.studies.calibrate import observation
@@ -25,7 +26,7 @@ from psd_deflection.studies.calibrate.calibrate import OPEN, ROTATED, undetermin
 from psd_deflection.studies.calibrate.check import LEVEL, MovedGroup, fitted_group, moved_group, overall_p
 from psd_deflection.studies.calibrate.fit import SIZE
 from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress, progress_of
-from psd_deflection.studies.calibrate.result import result
+from psd_deflection.studies.calibrate.result import result, values_of
 from tools.program import ROOT
 
 
@@ -94,10 +95,7 @@ def rows_of_two(offset: FloatArray) -> observation.Rows:
 def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind) -> None:
     """Score and information are those of dense least squares with four more unknowns, less those (Schur)."""
     rows, rig = rows_of_two(np.full(4, 1e-4)), rig_from_values({})
-    prior, weights = (
-        fitting.prior_of_rig(rig),
-        np.random.default_rng(1).uniform(0.1, 1.0, len(rows_of_two(np.zeros(4)))),
-    )
+    prior, weights = fitting.prior_of_rig(rig), np.random.default_rng(1).uniform(0.1, 1.0, len(rows))
     noise, none = fitting.Noise(np.array([3e-5, 2e-5, 1e-4]), 1.5, 2.0), np.zeros((SIZE, SIZE))
     linear = fitting.linearised(rows, prior.mean, rig, kind)
     best = fitting.CalibrationFit(prior.mean, none, none, linear, weights, noise, np.ones(SIZE, dtype=bool))
@@ -118,9 +116,7 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind
     size = np.sqrt(np.abs(np.diag(normal[:SIZE, :SIZE]))) + 1e-30
     scale = np.outer(size, size)
     np.testing.assert_allclose(
-        information / scale,
-        (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale,
-        atol=1e-8,
+        information / scale, (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale, atol=1e-8
     )
     reach = np.abs(right).max() + np.abs(right[:SIZE] / size).max() * size
     np.testing.assert_allclose(score / reach, (right[:SIZE] - gain @ right[SIZE:]) / reach, atol=1e-8)
@@ -140,6 +136,28 @@ def test_two_recordings_have_one_zero_after_the_offset_is_taken_off() -> None:
     np.testing.assert_allclose(best.values[ZERO:COUNT], again.values[ZERO:COUNT], atol=1e-8)
     np.testing.assert_allclose(best.covariance, fitting.posterior(best.information, prior, free), rtol=1e-9)
     assert not np.any(best.values[:ZERO] - prior.mean[:ZERO])
+
+
+def test_the_evidence_of_a_prior_is_the_probability_of_all_readings_at_once() -> None:
+    """Their covariance has a part of the prior's; a constant is left out, so that one prior is held against another."""
+    rows = rows_of_two(np.zeros(4))
+    rows = rows.at(np.arange(20))
+    prior, noise = fitting.prior_of_rig(RIG), fitting.Noise(np.array([2e-5, 2e-5, 2e-4]))
+    free = np.isin(fitting.NAMES, ('psd_1.gain_x', 'psd_1.rotation', 'psd_2.gain_y'))
+    mean = prior.mean + 0.1 * free * prior.sd
+    linear, none = fitting.linearised(rows, mean, RIG, 'reference'), np.zeros((SIZE, SIZE))
+    best = fitting.CalibrationFit(prior.mean, none, none, linear, np.ones(len(rows)), noise, free)
+    of_rows = block_diag(*np.linalg.inv(fitting.weight_matrices(linear, rows, noise)))
+    slopes, off = linear.slopes[:, :, free].reshape(-1, 3), []
+    for factor in (1.0, 0.01):
+        covariance = factor * prior.covariance
+        evidence, z = fitting.explained(rows, RIG, fitting.Prior(mean, covariance), 'reference', free, best)
+        shared = slopes @ covariance[np.ix_(free, free)]
+        all_at_once = of_rows + shared @ slopes.T
+        off.append(evidence - multivariate_normal(cov=1e12 * all_at_once).logpdf(1e6 * linear.residual.ravel()))
+        shift = shared.T @ np.linalg.solve(all_at_once, linear.residual.ravel())
+        np.testing.assert_allclose((z - mean)[free] / prior.sd[free], shift / prior.sd[free], atol=0.01)
+    assert off[0] == pytest.approx(off[1], abs=5e-3)
 
 
 def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
@@ -489,8 +507,14 @@ def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
     assert tree['groups'][0]['shifts'] == {'psd_1.gain_x': {'value': 0.02, 'sd': 0.001}}
 
 
-def test_a_rejection_is_in_the_file_and_none_is_null() -> None:
+def test_rejection_and_covariance_are_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
-    found = psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found
-    assert result(replace(found, rejected=''), '2026-11-26')['rejected'] is None
+    found = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found, rejected='')
+    assert result(found, '2026-11-26')['rejected'] is None
     assert result(replace(found, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'
+    # One parameter is known exactly: it is correlated with nothing.
+    covariance = found.covariance * (np.arange(SIZE) != 3) * (np.arange(SIZE)[:, None] != 3)
+    values, _ = values_of(replace(found, fit=replace(found.fit, covariance=covariance)), '2026-11-26')
+    written = known_of_rig(replace_values(found.rig, values)).covariance
+    off = (written - covariance[:COUNT, :COUNT]) / np.outer(TOLERANCES, TOLERANCES)
+    np.testing.assert_allclose(off, 0.0, atol=1e-8)
