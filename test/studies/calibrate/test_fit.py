@@ -83,9 +83,8 @@ def rows_of_two(offset: FloatArray) -> observation.Rows:
     loads, velocity = rng.uniform(-10.0, 10.0, (n, 3)), rng.normal(size=(n, 3)) * 1e-3
     pose += rng.normal(size=(n, 3)) * (2e-5, 2e-5, 2e-4)
     moved, nothing = np.full((n, 4), 1e-12), np.zeros(n, dtype=bool)
-    return observation.Rows(
-        np.linspace(0.0, 11.9, n), run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3))
-    )
+    t = np.linspace(0.0, 11.9, n)
+    return observation.Rows(t, run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3)))
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
@@ -112,9 +111,8 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind
     gain = normal[:SIZE, SIZE:] @ np.linalg.inv(normal[SIZE:, SIZE:])
     size = np.sqrt(np.abs(np.diag(normal[:SIZE, :SIZE]))) + 1e-30
     scale = np.outer(size, size)
-    np.testing.assert_allclose(
-        information / scale, (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale, atol=1e-8
-    )
+    reduced = normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]
+    np.testing.assert_allclose(information / scale, reduced / scale, atol=1e-8)
     reach = np.abs(right).max() + np.abs(right[:SIZE] / size).max() * size
     np.testing.assert_allclose(score / reach, (right[:SIZE] - gain @ right[SIZE:]) / reach, atol=1e-8)
 
@@ -122,8 +120,7 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind
 def test_two_recordings_have_one_zero_after_the_offset_is_taken_off() -> None:
     """As much as a beam may be off. What is left is the dots' noise and its mean's."""
     offset = np.array([4e-4, -3e-4, 2e-4, 5e-4])
-    free = np.zeros(SIZE, dtype=bool)
-    free[ZERO:COUNT] = True
+    free = (np.arange(SIZE) >= ZERO) & (np.arange(SIZE) < COUNT)
     rows, best = fitting.with_common_zero(rows_of_two(offset), RIG, PRIOR, 'reference', free)
     np.testing.assert_allclose(rows.dots, rows_of_two(np.zeros(4)).dots, atol=6e-6)
     assert best.noise.reference == pytest.approx([2e-5, 2e-5, 2e-4], rel=0.25)
@@ -156,8 +153,7 @@ def test_the_evidence_of_a_prior_is_the_probability_of_all_readings_at_once() ->
 
 
 def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
-    free = np.zeros(SIZE, dtype=bool)
-    free[: ZERO // 2] = True
+    free = np.arange(SIZE) < ZERO // 2
     found = fitting.fit(rows_of_two(np.zeros(4)), RIG, PRIOR, 'self', free=free).noise
     assert (found.reference.tolist(), found.fewer) == ([1.0, 1.0, 1.0], 1.0)
     assert found.dots == pytest.approx(1.0, rel=0.15)
@@ -254,6 +250,10 @@ def lit(n: int, noise: tuple[float, float, float, float], seed: int = 1) -> Floa
 def test_the_noise_of_each_channel_is_found() -> None:
     noise = (1e-3, 2e-3, 4e-3, 8e-3)
     assert observation.noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
+    # The steps of the converter are no noise.
+    rig, step = rig_from_values({'converter.bits': 10}), 20.0 / 1024.0
+    volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
+    assert observation.noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
 
 
 def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
@@ -293,9 +293,8 @@ def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
         assert len(found) >= 6
         assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
         if variances is small:
-            np.testing.assert_allclose(
-                found.variances, np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(found), 1))
-            )
+            least = np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(found), 1))
+            np.testing.assert_allclose(found.variances, least)
         else:
             # Twelve or thirteen rows in a quarter of a second.
             assert 1e-10 / 13.001 < found.variances.min() <= np.median(found.variances) < 1e-10 / 11.999
@@ -326,13 +325,6 @@ def test_half_of_the_deviations_report_that_of_all() -> None:
     assert fitting.deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
 
 
-def test_the_steps_of_the_converter_are_no_noise() -> None:
-    rig = rig_from_values({'converter.bits': 10})
-    step = 20.0 / 1024.0
-    volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
-    assert observation.noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
-
-
 @pytest.mark.parametrize('seed', range(3))
 def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None:
     names = [p.group for p in PARAMETERS[:ZERO]]
@@ -345,10 +337,8 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
     found = moved_group(group, at, score, m, scale)
     # In units of the prior, whose information is 1.
     covariance = np.linalg.inv(m[np.ix_(own, own)] + np.eye(len(own)))
-    shift = scale[own] * (covariance @ score[own])
-    sd = scale[own] * np.sqrt(np.diag(covariance))
-    assert [v for v, _ in found.shifts.values()] == pytest.approx(shift.tolist())
-    assert [s for _, s in found.shifts.values()] == pytest.approx(sd.tolist())
+    shift, sd = scale[own] * (covariance @ score[own]), scale[own] * np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose([*found.shifts.values()], np.column_stack([shift, sd]), rtol=1e-6)
 
 
 def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -363,12 +353,9 @@ def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyP
     group = MovedGroup('psd_1.gain', 0.01, 1.0, 2, dict.fromkeys(names, (0.0, 0.1)))
     nothing = cast(Any, None)
     found = fitted_group(group, nothing, nothing, PRIOR, 'reference', nothing, nothing, 3.0)
-    wider = np.zeros(len(PRIOR.mean))
-    for p in PARAMETERS:
-        if p.name in names:
-            wider[INDEX[p.name]] = 9.0 * p.tolerance**2
+    wider, at = np.zeros(SIZE), [INDEX[n] for n in names]
+    wider[at] = 9.0 * TOLERANCES[at] ** 2
     (prior,) = given
-    assert np.all(wider[[INDEX[n] for n in names]] > 0.0)
     np.testing.assert_allclose(prior.covariance, PRIOR.covariance + np.diag(wider), rtol=1e-12)
     assert np.array_equal(prior.mean, PRIOR.mean)
     # Against nothing moved; and what it moved by.
