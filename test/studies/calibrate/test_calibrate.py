@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration against rigs of the second generator in blind/; dark levels against photocurrents that add."""
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,13 +14,15 @@ from blind import calibration as campaign
 from blind import misaligned
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.model.detector import VoltsToDots
-from psd_deflection.records import FloatArray
+from psd_deflection.recordings.in_memory import RecordingInMemory
+from psd_deflection.records import AppliedLoad, FloatArray, RawChunk
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate import calibrate as module
 from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
 from psd_deflection.studies.calibrate.dark import dark_levels, result_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, prior_of_rig
+from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
 from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows
 from psd_deflection.studies.calibrate.result import values_of
 
@@ -45,13 +49,15 @@ def calibrated(rig: Rig, truth: dict[str, float], pose: FloatArray, seed: int = 
     return calibrate([campaign.run_of(recorded)], rig)
 
 
-def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: FloatArray) -> None:
-    found = calibrated(nominal, only(psd_2__rotation=0.02), pose)
+def test_a_turned_psd_is_found_with_its_sign_and_the_noise(nominal: Rig, pose: FloatArray) -> None:
+    found = calibrated(nominal, only(psd_2__rotation=0.02), pose, spread=(5e-6, 20e-6, 1e-3))
     rotated = found.values[AT['psd_2.rotation']]
     # Half the difference of the crosstalks looks the same, and gets its share.
     skew = found.values[AT['psd_2.crosstalk_xy']] - found.values[AT['psd_2.crosstalk_yx']]
     assert rotated + skew / 2.0 == pytest.approx(0.02, abs=2e-4)
     assert rotated > 0.015
+    assert found.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
+    assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
 
 
 def test_errors_are_those_that_are_reported(nominal: Rig, pose: FloatArray) -> None:
@@ -77,12 +83,6 @@ def test_outliers_do_not_move_it(nominal: Rig, pose: FloatArray) -> None:
     assert off[: AT['psd_1.zero_x']].max() < 3.0
 
 
-def test_the_noise_of_reference_and_channels_is_reported(nominal: Rig, pose: FloatArray) -> None:
-    found = calibrated(nominal, only(), pose, spread=(5e-6, 20e-6, 1e-3))
-    assert found.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
-    assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
-
-
 def test_undetermined_parameter_keeps_value_and_sd(nominal: Rig) -> None:
     """Forces along Y alone move no dot along x and turn nothing."""
     rng = np.random.default_rng(4)
@@ -104,11 +104,10 @@ def test_frames_count_as_much_as_they_say(nominal: Rig, pose: FloatArray) -> Non
     share = np.where(np.arange(len(run.reference)) % 2, 3.0, 1.0)[:, None] * np.ones(3)
     noisy = pose[recorded.frames] + (run.reference - pose[recorded.frames]) * share
     # In its own units: only the proportions are believed.
-    stated = CalibrationRun(
-        run.name, run.t, run.volts, run.reference_t, noisy, reference_sd=7.0 * share * misaligned.CAMERA
+    known, guessed = (
+        calibrate([replace(run, reference=noisy, reference_sd=sd)], nominal)
+        for sd in (7.0 * share * misaligned.CAMERA, None)
     )
-    unstated = CalibrationRun(run.name, run.t, run.volts, run.reference_t, noisy)
-    known, guessed = calibrate([stated], nominal), calibrate([unstated], nominal)
     clock = AT['reference.clock']
     assert known.sd[clock] < guessed.sd[clock] / 1.4
     assert abs(known.clock + known.values[clock]) < 4.0 * known.sd[clock]
@@ -146,39 +145,55 @@ def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
 
 @pytest.mark.slow
 def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
-    recorded = misaligned.record(only(), pose, np.random.default_rng(2))
-    run = campaign.run_of(recorded)
-    late = CalibrationRun(run.name, run.t, run.volts, run.reference_t + 0.0123, run.reference)
-    found = calibrate([late], nominal)
-    clock = found.clock + found.values[AT['reference.clock']]
-    assert clock == pytest.approx(-0.0123, abs=2e-4)
+    run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
+    found = calibrate([replace(run, reference_t=run.reference_t + 0.0123)], nominal)
+    assert found.clock + found.values[AT['reference.clock']] == pytest.approx(-0.0123, abs=2e-4)
     assert found.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
+
+
+def test_a_non_linearity_that_does_not_last_is_dropped(nominal: Rig) -> None:
+    """Of the other sign in every second eighth: on what was left out of a fit it is worse than none."""
+    pose = misaligned.poses(np.tile(misaligned.pushes(np.random.default_rng(4), 6, 0.1), (8, 1)))
+    one, other = (
+        misaligned.record(only(psd_1__nonlinearity=k), pose, np.random.default_rng(1), every=10) for k in (2e2, -2e2)
+    )
+    odd = np.arange(len(pose))[:, None] * 8 // len(pose) % 2 == 1
+    found = calibrate([campaign.run_of(replace(one, volts=np.where(odd, other.volts, one.volts)))], nominal)
+    assert 'psd_1.nonlinearity' in found.dropped
+    assert found.values[AT['psd_1.nonlinearity']] == 0.0
+    # It is known better all the same.
+    assert found.sd[AT['psd_1.nonlinearity']] < 0.5 * found.prior.sd[AT['psd_1.nonlinearity']]
+
+
+def test_a_recording_is_taken_with_its_rig_and_the_load_of_each_sample(tmp_path: Path) -> None:
+    """A load that is a fifth of a sample late counts for that sample, one that is a third late for the next."""
+    rig = rig_from_values({'link.length': 0.6})
+    t_ns, volts = 10**9 + 10**6 * np.arange(80), np.full((80, 6), 5.0, dtype=np.float32)
+    loads = [AppliedLoad(1_020_200_000, 10.0, 0.0, 0.0), AppliedLoad(1_060_333_000, 20.0, 0.0, 0.0)]
+    recording = RecordingInMemory(tmp_path, None, RawChunk(np.arange(80), t_ns, volts, np.zeros(80, np.uint8)), loads)
+    recording.parameters = rig.flat()
+    assert CalibrationOptions().rig([recording], pytest.fail).flat() == rig.flat()
+    (run,) = CalibrationOptions().runs([recording], rig)
+    assert run.loads is not None
+    assert run.loads.tolist() == [[10.0 * (i >= 20) + 10.0 * (i >= 61), 0.0, 0.0] for i in range(80)]
+    assert (len(run.reference_t), len(run.reference)) == (0, 0)
+    with pytest.raises(RecordingError, match=r'neither a reference .* nor known loads; --self'):
+        calibrate([replace(run, loads=None)], rig)
 
 
 def test_a_reference_that_is_no_reference_is_rejected(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
-    wrong = CalibrationRun(
-        run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference)
-    )
-    found = calibrate([wrong], nominal)
+    found = calibrate([replace(run, reference=np.random.default_rng(1).permutation(run.reference))], nominal)
     assert found.rejected.startswith('on motion that was not fitted')
     values, effects = values_of(found, 'today')
     assert not effects
     assert set(values) == {'psd_1.noise', 'psd_2.noise'}
 
 
-def test_a_recording_without_reference_and_loads_is_rejected(nominal: Rig, pose: FloatArray) -> None:
-    run = campaign.run_of(misaligned.record(only(), pose[:2000], np.random.default_rng(2)))
-    with pytest.raises(RecordingError, match=r'neither a reference .* nor known loads; --self'):
-        calibrate([CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)
-
-
 @pytest.mark.slow
 def test_the_redundant_reading_alone_reports_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
-    found = calibrate(
-        [CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True
-    )
+    found = calibrate([run], nominal, alone=True)
     # Along the base line (0.1, 0.07), which the one reading too many sees when the plate goes along X.
     v = {name: found.values[i] for name, i in AT.items()}
     along = v['psd_1.gain_x'] - v['psd_2.gain_x']
@@ -200,6 +215,16 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     assert found.sd[AT['psd_1.gain_x']] > 0.003
 
 
+def test_a_check_reports_where_the_beams_are_from_the_zero_of_the_file(nominal: Rig) -> None:
+    pose = misaligned.poses(misaligned.pushes(np.random.default_rng(3), 3, 0.5))
+    truth = only(beam_1__x=1.2e-3, beam_1__y=-2.1e-3, beam_2__x=2e-4)
+    rig = replace_values(nominal, {'psd_1.zero': [1e-3, -2e-3], 'psd_2.zero': [3e-4, 1e-4]})
+    found = check([campaign.run_of(misaligned.record(truth, pose, np.random.default_rng(1)))], rig)
+    off = np.abs(found.zero - (2e-4, -1e-4, -1e-4, -1e-4))
+    assert found.unchanged
+    assert np.all((off < 2e-5) & (off < 4.0 * found.zero_sd))
+
+
 @pytest.mark.slow
 def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     rng = np.random.default_rng(9)
@@ -219,8 +244,7 @@ def test_contradicted_priors_widen_once_worst_first(nominal: Rig, monkeypatch: p
     prior = prior_of_rig(nominal)
     worst, next_one = AT['clamp.bending_compliance'], AT['psd_1.rotation']
     values = prior.mean.copy()
-    values[worst] += 400.0 * prior.sd[worst]
-    values[next_one] += 300.0 * prior.sd[next_one]
+    values[[worst, next_one]] += (400.0, 300.0) * prior.sd[[worst, next_one]]
     first = cast(CalibrationFit, SimpleNamespace(values=values, covariance=1e-6 * prior.covariance))
     # A fit that stays where it is.
     monkeypatch.setattr(module, 'fit', lambda *_, start, **__: start)
@@ -264,23 +288,25 @@ def test_levels_are_within_what_is_reported_of_them_in_95_of_100(nominal: Rig) -
     assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
 
 
-def test_the_error_of_twenty_pieces_is_students(nominal: Rig) -> None:
-    """Means that alternate by 1 mV, so that none follows from the one before."""
-    volts = np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + np.repeat(1e-3 * (-1.0) ** np.arange(20), 250)[:, None]
-    (one, _) = dark_levels([run_of(volts)], nominal)
-    assert one.sd == pytest.approx(np.full(3, 2.093024 / 1.959964 * 1e-3 / 19**0.5), rel=1e-5)
+STUDENT = 2.093024 / 1.959964
 
 
-def test_the_error_of_white_noise_is_that_of_a_mean(nominal: Rig) -> None:
-    (one, _) = dark_levels([run_of(white((1.0, 2.0, 0.1, 0.0, 0.0, 0.1), 16_000))], nominal)
-    assert one.sd == pytest.approx(np.full(3, 2e-3 / 16_000**0.5), rel=0.45)
-
-
-def test_steps_that_noise_does_not_dither_are_an_uncertainty(nominal: Rig) -> None:
-    """A steady number on a converter of 305 µV a step may be anything within the step: 88 µV rms."""
-    volts = np.tile([1.0, 2.0, 0.1, 0.0, 0.0, 0.1], (4000, 1))
-    (one, _) = dark_levels([run_of(volts)], nominal)
-    assert one.sd == pytest.approx(np.full(3, 20.0 / 65536.0 / 12.0**0.5), rel=0.01)
+@pytest.mark.parametrize(
+    ('off', 'sd', 'rel'),
+    [
+        # Means of twenty pieces; none follows from the one before.
+        (np.repeat([1e-3, -1e-3] * 10, 250), STUDENT * 1e-3 / 19**0.5, 1e-5),
+        # Of neighbours 17 are alike and 2 are not: a correlation of 15/20, and (1 + 3/4)/(1 - 3/4) count as one.
+        (np.repeat(1e-3 * np.array([1] * 5 + [-1] * 10 + [1] * 5), 250), STUDENT * 1e-3 * (7.0 / 19.0) ** 0.5, 1e-5),
+        # White noise has the error of a mean.
+        (np.random.default_rng(2).normal(0.0, 2e-3, 16_000), 2e-3 / 16_000**0.5, 0.45),
+        # A steady number on a converter of 305 µV a step may be anything within the step.
+        (np.zeros(4000), 20.0 / 65536.0 / 12.0**0.5, 0.01),
+    ],
+)
+def test_the_error_of_a_level_is_that_of_what_varies(nominal: Rig, off: FloatArray, sd: float, rel: float) -> None:
+    (one, _) = dark_levels([run_of(np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + off[:, None])], nominal)
+    assert one.sd == pytest.approx(np.full(3, sd), rel=rel)
 
 
 def test_what_is_reported_of_one_psd(nominal: Rig) -> None:
@@ -293,8 +319,7 @@ def test_what_is_reported_of_one_psd(nominal: Rig) -> None:
     assert one.place == pytest.approx([1.5e-3, -1.0e-3], abs=1e-6)
     assert one.residual == pytest.approx(5e-3 * one.sd[2] / 5.12)
     tree = result_of_levels([one])['psd_1']
-    assert tree['sum']['value'] == one.volts[2]
-    assert (tree['sum']['file'], tree['sum']['unit']) == (0.0, 'V')
+    assert tree['sum'] == {'value': one.volts[2], 'sd': one.sd[2], 'unit': 'V', 'file': 0.0}
     assert tree['recording'] == {'name': 'off.csv', 'sha256': 'ab' * 32}
     assert words_of_level(one).startswith('psd_1 with its laser off: sum 0.119')
     assert ' % of the light pulls to (+1.50, -1.00) mm; what ' in words_of_level(one).replace('%', ' %')

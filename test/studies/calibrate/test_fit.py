@@ -8,16 +8,17 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 
 import psd_deflection
 from blind import misaligned
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import COUNT, INDEX, PARAMETERS, TOLERANCES, ZERO
-from psd_deflection.model.misalignment.rig import vector_of_rig
+from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import rig_from_values
+from psd_deflection.rig.config import replace_values, rig_from_values
 from psd_deflection.studies.calibrate import check as checking
 from psd_deflection.studies.calibrate import fit as fitting
 from psd_deflection.studies.calibrate import observation
@@ -25,41 +26,39 @@ from psd_deflection.studies.calibrate.calibrate import OPEN, ROTATED, undetermin
 from psd_deflection.studies.calibrate.check import LEVEL, MovedGroup, fitted_group, moved_group, overall_p
 from psd_deflection.studies.calibrate.fit import SIZE
 from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress, progress_of
-from psd_deflection.studies.calibrate.result import result
+from psd_deflection.studies.calibrate.result import result, values_of
 from tools.program import ROOT
+
+RIG = rig_from_values({})
+PRIOR = fitting.prior_of_rig(RIG)
 
 
 def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
     """The pose has the least sum of squares, each reading over its own variance: no other pose is as likely."""
-    rig = rig_from_values({})
-    p, length = vector_of_rig(rig).values, rig.link.length
+    p, length = vector_of_rig(RIG).values, RIG.link.length
     rng = np.random.default_rng(2)
     true = rng.uniform(-1.0, 1.0, (3, 3)) * (1e-3, 1e-3, 5e-3)
     sd = np.array([2e-6, 20e-6, 8e-6, 1e-6]) * rng.uniform(0.5, 2.0, (3, 4))
     dots = misaligned.dots(misaligned.nominal(), true) + sd * rng.normal(size=sd.shape)
     found = fitting.pose_of_readings(dots, sd**2, p, length)
 
-    def misfit(pose: FloatArray, row: int) -> float:
-        residual = (dots[row] - misaligned.dots(misaligned.nominal(), pose[None])[0]) / sd[row]
+    def misfit(x: FloatArray, pose: FloatArray, row: int) -> float:
+        moved = pose + x * (1e-6, 1e-6, 1e-5)
+        residual = (dots[row] - misaligned.dots(misaligned.nominal(), moved[None])[0]) / sd[row]
         return float(residual @ residual)
 
     for row, pose in enumerate(found):
-
-        def of(x: FloatArray, pose: FloatArray = pose, row: int = row) -> float:
-            return misfit(pose + x * (1e-6, 1e-6, 1e-5), row)
-
-        best = minimize(of, np.zeros(3), method='Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
+        best = minimize(misfit, np.zeros(3), (pose, row), 'Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
         np.testing.assert_allclose(best.x, 0.0, atol=0.02)
-        assert misfit(pose, row) == pytest.approx(best.fun, abs=1e-3)
+        assert misfit(np.zeros(3), pose, row) == pytest.approx(best.fun, abs=1e-3)
 
 
 def test_clamp_prior_is_a_fifth_of_link_compliance() -> None:
     """In the deflection by a tip force, L^3/3EI, and in the twist by a moment, L/GJ."""
-    rig = rig_from_values({})
-    bends, twists = fitting.prior_of_rig(rig).sd[fitting.CLAMP_AT : fitting.CLAMP_AT + 2]
-    length = rig.link.length
-    assert bends * length**2 == pytest.approx(0.2 * length**3 / (3.0 * rig.link.bending_stiffness))
-    assert twists == pytest.approx(0.2 * length / rig.link.torsional_stiffness)
+    bends, twists = PRIOR.sd[fitting.CLAMP_AT : fitting.CLAMP_AT + 2]
+    length = RIG.link.length
+    assert bends * length**2 == pytest.approx(0.2 * length**3 / (3.0 * RIG.link.bending_stiffness))
+    assert twists == pytest.approx(0.2 * length / RIG.link.torsional_stiffness)
 
 
 def test_rows_that_are_worth_fewer_weigh_less() -> None:
@@ -74,33 +73,33 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
 
 
 def rows_of_two(offset: FloatArray) -> observation.Rows:
-    """Two recordings of one rig; the readings of the second are off by ``offset`` (4,), m."""
+    """Two recordings of one rig; before the second the beams were aimed anew, by ``offset`` (4,), m."""
     rng, n = np.random.default_rng(8), 120
     pose = rng.uniform(-1.0, 1.0, (n, 3)) * (3e-3, 3e-3, 2e-2)
     run = np.repeat([0, 1], n // 2)
-    dots: FloatArray = (
-        misaligned.dots(misaligned.nominal(), pose) + 1e-6 * rng.normal(size=(n, 4)) + run[:, None] * offset
-    )
+    aimed = dict(zip(('beam_1.x', 'beam_1.y', 'beam_2.x', 'beam_2.y'), offset.tolist(), strict=True))
+    first, second = (misaligned.dots(misaligned.nominal() | beams, pose) for beams in ({}, aimed))
+    dots = np.where(run[:, None], second, first) + 1e-6 * rng.normal(size=(n, 4))
     loads, velocity = rng.uniform(-10.0, 10.0, (n, 3)), rng.normal(size=(n, 3)) * 1e-3
     pose += rng.normal(size=(n, 3)) * (2e-5, 2e-5, 2e-4)
     moved, nothing = np.full((n, 4), 1e-12), np.zeros(n, dtype=bool)
-    return observation.Rows(
-        np.linspace(0.0, 11.9, n), run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3))
-    )
+    t = np.linspace(0.0, 11.9, n)
+    return observation.Rows(t, run, pose, dots, moved, velocity, loads, nothing, np.ones((n, 3)))
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
 def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind) -> None:
     """Score and information are those of dense least squares with four more unknowns, less those (Schur)."""
-    rows, rig = rows_of_two(np.full(4, 1e-4)), rig_from_values({})
-    prior, weights = (
-        fitting.prior_of_rig(rig),
-        np.random.default_rng(1).uniform(0.1, 1.0, len(rows_of_two(np.zeros(4)))),
-    )
+    rows = rows_of_two(np.full(4, 1e-4))
+    weights = np.random.default_rng(1).uniform(0.1, 1.0, len(rows))
     noise, none = fitting.Noise(np.array([3e-5, 2e-5, 1e-4]), 1.5, 2.0), np.zeros((SIZE, SIZE))
-    linear = fitting.linearised(rows, prior.mean, rig, kind)
-    best = fitting.CalibrationFit(prior.mean, none, none, linear, weights, noise, np.ones(SIZE, dtype=bool))
-    score, information = fitting.score_at(rows, prior.mean, rig, kind, best)
+    linear = fitting.linearised(rows, PRIOR.mean, RIG, kind)
+    for i in (fitting.CLAMP_AT, fitting.CLAMP_AT + 1, fitting.CLOCK):
+        step = PRIOR.sd[i] * (np.arange(SIZE) == i)
+        less = linear.residual - fitting.linearised(rows, PRIOR.mean + step, RIG, kind).residual
+        np.testing.assert_allclose(linear.slopes @ step, less, atol=1e-9 * np.abs(linear.residual).max())
+    best = fitting.CalibrationFit(PRIOR.mean, none, none, linear, weights, noise, np.ones(SIZE, dtype=bool))
+    score, information = fitting.score_at(rows, PRIOR.mean, RIG, kind, best)
     normal, right = np.zeros((SIZE + 4, SIZE + 4)), np.zeros(SIZE + 4)
     normal[SIZE:, SIZE:] = np.diag(TOLERANCES[ZERO:COUNT] ** -2)
     for j in range(len(rows)):
@@ -112,36 +111,50 @@ def test_a_zero_of_its_own_is_as_a_parameter_of_its_recording(kind: fitting.Kind
     gain = normal[:SIZE, SIZE:] @ np.linalg.inv(normal[SIZE:, SIZE:])
     size = np.sqrt(np.abs(np.diag(normal[:SIZE, :SIZE]))) + 1e-30
     scale = np.outer(size, size)
-    np.testing.assert_allclose(
-        information / scale,
-        (normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]) / scale,
-        atol=1e-8,
-    )
+    reduced = normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE]
+    np.testing.assert_allclose(information / scale, reduced / scale, atol=1e-8)
     reach = np.abs(right).max() + np.abs(right[:SIZE] / size).max() * size
     np.testing.assert_allclose(score / reach, (right[:SIZE] - gain @ right[SIZE:]) / reach, atol=1e-8)
 
 
 def test_two_recordings_have_one_zero_after_the_offset_is_taken_off() -> None:
-    """A zero moves readings under load by nearly as much: what is left is the dots' noise and its mean's."""
-    offset, rig = np.array([4e-5, -3e-5, 2e-5, 5e-5]), rig_from_values({})
-    prior = fitting.prior_of_rig(rig)
-    free = np.zeros(SIZE, dtype=bool)
-    free[ZERO:COUNT] = True
-    rows, best = fitting.with_common_zero(rows_of_two(offset), rig, prior, 'reference', free)
+    """As much as a beam may be off. What is left is the dots' noise and its mean's."""
+    offset = np.array([4e-4, -3e-4, 2e-4, 5e-4])
+    free = (np.arange(SIZE) >= ZERO) & (np.arange(SIZE) < COUNT)
+    rows, best = fitting.with_common_zero(rows_of_two(offset), RIG, PRIOR, 'reference', free)
     np.testing.assert_allclose(rows.dots, rows_of_two(np.zeros(4)).dots, atol=6e-6)
     assert best.noise.reference == pytest.approx([2e-5, 2e-5, 2e-4], rel=0.25)
     assert best.noise.dots == pytest.approx(1.0, rel=0.25)
-    again = fitting.fit(rows, rig, prior, 'reference', free=free)
+    again = fitting.fit(rows, RIG, PRIOR, 'reference', free=free)
     np.testing.assert_allclose(best.values[ZERO:COUNT], again.values[ZERO:COUNT], atol=1e-8)
-    np.testing.assert_allclose(best.covariance, fitting.posterior(best.information, prior, free), rtol=1e-9)
-    assert not np.any(best.values[:ZERO] - prior.mean[:ZERO])
+    np.testing.assert_allclose(best.covariance, fitting.posterior(best.information, PRIOR, free), rtol=1e-9)
+    assert not np.any(best.values[:ZERO] - PRIOR.mean[:ZERO])
+
+
+def test_the_evidence_of_a_prior_is_the_probability_of_all_readings_at_once() -> None:
+    """Their covariance has a part of the prior's; a constant is left out, so that one prior is held against another."""
+    rows = rows_of_two(np.zeros(4)).at(np.arange(20))
+    noise = fitting.Noise(np.array([2e-5, 2e-5, 2e-4]))
+    free = np.isin(fitting.NAMES, ('psd_1.gain_x', 'psd_1.rotation', 'psd_2.gain_y'))
+    mean = PRIOR.mean + 0.1 * free * PRIOR.sd
+    linear, none = fitting.linearised(rows, mean, RIG, 'reference'), np.zeros((SIZE, SIZE))
+    best = fitting.CalibrationFit(PRIOR.mean, none, none, linear, np.ones(len(rows)), noise, free)
+    of_rows = block_diag(*np.linalg.inv(fitting.weight_matrices(linear, rows, noise)))
+    slopes, off = linear.slopes[:, :, free].reshape(-1, 3), []
+    for factor in (1.0, 0.01):
+        covariance = factor * PRIOR.covariance
+        evidence, z = fitting.explained(rows, RIG, fitting.Prior(mean, covariance), 'reference', free, best)
+        shared = slopes @ covariance[np.ix_(free, free)]
+        all_at_once = of_rows + shared @ slopes.T
+        off.append(evidence - multivariate_normal(cov=1e12 * all_at_once).logpdf(1e6 * linear.residual.ravel()))
+        shift = shared.T @ np.linalg.solve(all_at_once, linear.residual.ravel())
+        np.testing.assert_allclose((z - mean)[free] / PRIOR.sd[free], shift / PRIOR.sd[free], atol=0.01)
+    assert off[0] == pytest.approx(off[1], abs=5e-3)
 
 
 def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
-    free = np.zeros(SIZE, dtype=bool)
-    free[: ZERO // 2] = True
-    rig = rig_from_values({})
-    found = fitting.fit(rows_of_two(np.zeros(4)), rig, fitting.prior_of_rig(rig), 'self', free=free).noise
+    free = np.arange(SIZE) < ZERO // 2
+    found = fitting.fit(rows_of_two(np.zeros(4)), RIG, PRIOR, 'self', free=free).noise
     assert (found.reference.tolist(), found.fewer) == ([1.0, 1.0, 1.0], 1.0)
     assert found.dots == pytest.approx(1.0, rel=0.15)
 
@@ -162,12 +175,10 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: fitting.Kind,
         Any, SimpleNamespace(sd=np.ones((n, 3)), variances=np.full((n, 4), sd**2), run=np.zeros(n, dtype=np.int64))
     )
     linear = fitting.Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
-    prior = fitting.prior_of_rig(rig_from_values({}))
-    found = fitting.variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
+    found = fitting.variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), PRIOR)
     assert found.dots == pytest.approx(reported)
 
 
-RIG = rig_from_values({})
 PERIOD = 1e-3
 
 
@@ -239,6 +250,10 @@ def lit(n: int, noise: tuple[float, float, float, float], seed: int = 1) -> Floa
 def test_the_noise_of_each_channel_is_found() -> None:
     noise = (1e-3, 2e-3, 4e-3, 8e-3)
     assert observation.noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
+    # The steps of the converter are no noise.
+    rig, step = rig_from_values({'converter.bits': 10}), 20.0 / 1024.0
+    volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
+    assert observation.noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
 
 
 def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
@@ -278,9 +293,8 @@ def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
         assert len(found) >= 6
         assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
         if variances is small:
-            np.testing.assert_allclose(
-                found.variances, np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(found), 1))
-            )
+            least = np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(found), 1))
+            np.testing.assert_allclose(found.variances, least)
         else:
             # Twelve or thirteen rows in a quarter of a second.
             assert 1e-10 / 13.001 < found.variances.min() <= np.median(found.variances) < 1e-10 / 11.999
@@ -311,13 +325,6 @@ def test_half_of_the_deviations_report_that_of_all() -> None:
     assert fitting.deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
 
 
-def test_the_steps_of_the_converter_are_no_noise() -> None:
-    rig = rig_from_values({'converter.bits': 10})
-    step = 20.0 / 1024.0
-    volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
-    assert observation.noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
-
-
 @pytest.mark.parametrize('seed', range(3))
 def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None:
     names = [p.group for p in PARAMETERS[:ZERO]]
@@ -330,14 +337,11 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
     found = moved_group(group, at, score, m, scale)
     # In units of the prior, whose information is 1.
     covariance = np.linalg.inv(m[np.ix_(own, own)] + np.eye(len(own)))
-    shift = scale[own] * (covariance @ score[own])
-    sd = scale[own] * np.sqrt(np.diag(covariance))
-    assert [v for v, _ in found.shifts.values()] == pytest.approx(shift.tolist())
-    assert [s for _, s in found.shifts.values()] == pytest.approx(sd.tolist())
+    shift, sd = scale[own] * (covariance @ score[own]), scale[own] * np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose([*found.shifts.values()], np.column_stack([shift, sd]), rtol=1e-6)
 
 
 def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
-    reported = fitting.prior_of_rig(rig_from_values({}))
     names = [p.name for p in PARAMETERS if p.group == 'psd_1.gain']
     given: list[fitting.Prior] = []
 
@@ -348,15 +352,12 @@ def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(checking, 'explained', explained)
     group = MovedGroup('psd_1.gain', 0.01, 1.0, 2, dict.fromkeys(names, (0.0, 0.1)))
     nothing = cast(Any, None)
-    found = fitted_group(group, nothing, nothing, reported, 'reference', nothing, nothing, 3.0)
-    wider = np.zeros(len(reported.mean))
-    for p in PARAMETERS:
-        if p.name in names:
-            wider[INDEX[p.name]] = 9.0 * p.tolerance**2
+    found = fitted_group(group, nothing, nothing, PRIOR, 'reference', nothing, nothing, 3.0)
+    wider, at = np.zeros(SIZE), [INDEX[n] for n in names]
+    wider[at] = 9.0 * TOLERANCES[at] ** 2
     (prior,) = given
-    assert np.all(wider[[INDEX[n] for n in names]] > 0.0)
-    np.testing.assert_allclose(prior.covariance, reported.covariance + np.diag(wider), rtol=1e-12)
-    assert np.array_equal(prior.mean, reported.mean)
+    np.testing.assert_allclose(prior.covariance, PRIOR.covariance + np.diag(wider), rtol=1e-12)
+    assert np.array_equal(prior.mean, PRIOR.mean)
     # Against nothing moved; and what it moved by.
     assert found.evidence == pytest.approx(4.0)
     assert [v for v, _ in found.shifts.values()] == pytest.approx([0.5] * len(names))
@@ -375,49 +376,40 @@ def test_at_most_5_percent_of_sound_rigs_are_reported(shared: float, least: floa
 
 
 def test_uninformed_parameters_are_undetermined() -> None:
-    prior = fitting.prior_of_rig(rig_from_values({}))
-    size = len(prior.mean)
-    free = np.ones(size, dtype=bool)
-    each = 1e4 / prior.sd**2
-    information = np.diag(each)
+    free = np.ones(SIZE, dtype=bool)
+    information = np.diag(1e4 / PRIOR.sd**2)
     open_one, (a, b) = INDEX['psd_2.height'], (INDEX['psd_1.gain_x'], INDEX['psd_2.gain_x'])
     information[open_one, open_one] = 0.0
     # Of two gains only the sum is told.
-    pair = np.zeros(size)
-    pair[[a, b]] = 1.0 / prior.sd[[a, b]]
+    pair = np.zeros(SIZE)
+    pair[[a, b]] = 1.0 / PRIOR.sd[[a, b]]
     information[[a, b], [a, b]] = 0.0
     information += 1e4 * np.outer(pair, pair)
-    full = cast(
-        Any, SimpleNamespace(covariance=fitting.posterior(information, prior, free), information=information, free=free)
-    )
-    found = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, prior)}
+    covariance = fitting.posterior(information, PRIOR, free)
+    full = cast(Any, SimpleNamespace(covariance=covariance, information=information, free=free))
+    found = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, PRIOR)}
     assert set(found) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
     one, other = found['psd_1.gain_x', 'psd_2.gain_x'].values()
     assert (abs(one), one + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
 
 
 def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
-    rig = rig_from_values({})
-    prior = fitting.prior_of_rig(rig)
-    n, size = 40, len(prior.mean)
+    n = 40
     rng = np.random.default_rng(7)
     loads = np.column_stack([rng.uniform(-50.0, 50.0, (n, 2)), rng.uniform(-20.0, 20.0, n)])
     bends, twists = 2e-5, 3e-4
-    own = np.diag(LinkStatics.from_rig(rig).compliance)
-    pose = loads * (own + np.array([bends, bends, twists]) * [rig.link.length**2, rig.link.length**2, 1.0])
+    own = np.diag(LinkStatics.from_rig(RIG).compliance)
+    pose = loads * (own + np.array([bends, bends, twists]) * [RIG.link.length**2, RIG.link.length**2, 1.0])
     pose[3] += (5e-3, 5e-3, 0.1)
     weights, zeros = np.ones(n), np.zeros((n, 3))
     weights[3] = 0.0
     rest, run = np.ones(n, dtype=bool), np.zeros(n, dtype=np.int64)
     seconds = np.asarray(0.02 * np.arange(n), dtype=np.float64)
     rows = observation.Rows(seconds, run, pose, np.zeros((n, 4)), np.ones((n, 4)), zeros, loads, rest, zeros + 1.0)
-    linear = fitting.Linear(np.zeros((n, 4)), np.zeros((n, 4, size)), np.zeros((n, 4, 3)))
-    free = np.zeros(size, dtype=bool)
+    linear, none = fitting.Linear(np.zeros((n, 4)), np.zeros((n, 4, SIZE)), np.zeros((n, 4, 3))), np.zeros((SIZE, SIZE))
     noise = fitting.Noise(np.array([1e-7, 1e-7, 1e-7]))
-    full = fitting.CalibrationFit(
-        np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free
-    )
-    found = with_clamp(full, rows, rig, prior)
+    full = fitting.CalibrationFit(np.zeros(SIZE), none, none, linear, weights, noise, np.zeros(SIZE, dtype=bool))
+    found = with_clamp(full, rows, RIG, PRIOR)
     assert found.values[fitting.CLAMP_AT : fitting.CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
 
 
@@ -461,15 +453,11 @@ def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(left: float, determined
 
 def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
     parameter = ParameterProgress(name='n', words='a', value='b', left=0.1, determined=True)
-    row = {**parameter._asdict(), 'filled': parameter.filled}
-    assert CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree() == {
-        'kind': 'reference',
-        'seconds': 2.0,
-        'determined': 1,
-        'rejected': 'too short',
-        'parameters': [row],
-        'needs': [{'motion': 'push', 'names': ('n',)}],
-    }
+    tree = CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree()
+    row, need = {**parameter._asdict(), 'filled': parameter.filled}, {'motion': 'push', 'names': ('n',)}
+    assert tree.pop('parameters') == [row]
+    assert tree.pop('needs') == [need]
+    assert tree == {'kind': 'reference', 'seconds': 2.0, 'determined': 1, 'rejected': 'too short'}
 
 
 def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
@@ -484,8 +472,14 @@ def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
     assert tree['groups'][0]['shifts'] == {'psd_1.gain_x': {'value': 0.02, 'sd': 0.001}}
 
 
-def test_a_rejection_is_in_the_file_and_none_is_null() -> None:
+def test_rejection_and_covariance_are_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
-    found = psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found
-    assert result(replace(found, rejected=''), '2026-11-26')['rejected'] is None
+    found = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found, rejected='')
+    assert result(found, '2026-11-26')['rejected'] is None
     assert result(replace(found, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'
+    # One parameter is known exactly: it is correlated with nothing.
+    covariance = found.covariance * (np.arange(SIZE) != 3) * (np.arange(SIZE)[:, None] != 3)
+    values, _ = values_of(replace(found, fit=replace(found.fit, covariance=covariance)), '2026-11-26')
+    written = known_of_rig(replace_values(found.rig, values)).covariance
+    off = (written - covariance[:COUNT, :COUNT]) / np.outer(TOLERANCES, TOLERANCES)
+    np.testing.assert_allclose(off, 0.0, atol=1e-8)
