@@ -209,10 +209,7 @@ def test_diagnostics_say_whose_noise_it_is(flat: bool, words: str) -> None:
     assert dict(estimator.words())['covariance from'] == words
     assert len(estimator.words()) == (6 + len(estimator.noise_words()) if flat else 5)
     # 2 mV and a step of 0.3 mV are 1.001 um a sample; a mean of 20 has that over 4.47.
-    assert estimator.noise_words()[0] == (
-        'noise of x1 (um)',
-        '1.001 a sample (rig file 1.001), 0.224 a block (0.224)',
-    )
+    assert estimator.noise_words()[0] == ('noise of x1 (um)', '1.001 a sample (rig file 1.001), 0.224 a block (0.224)')
 
 
 @pytest.mark.parametrize(

@@ -227,8 +227,7 @@ def test_a_memory_is_observed_in_more_than_400_samples_at_rest(n: int, known: bo
 
 
 @pytest.mark.parametrize(
-    ('errors', 'coloured'),
-    [((4.6, 3, 0, 0, 0, 0), 0), ((5.4, 3, 0, 0, 0, 0), 1), ((5.4, 5.4, 5.4, 5.4, 3, 1), 5)],
+    ('errors', 'coloured'), [((4.6, 3, 0, 0, 0, 0), 0), ((5.4, 3, 0, 0, 0, 0), 1), ((5.4, 5.4, 5.4, 5.4, 3, 1), 5)]
 )
 def test_a_weak_memory_counts_beside_clear_ones(errors: tuple[float, ...], coloured: int) -> None:
     """A correlation of neighbours of five of its standard errors; of two, if most channels have that."""
