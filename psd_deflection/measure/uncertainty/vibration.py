@@ -194,7 +194,7 @@ class ToneSearch:
         cross = self._together(self._grouped(every))
         own = np.sqrt(np.diagonal(cross, axis1=1, axis2=2)) + _LEAST
         alike = np.abs(cross) / (own[:, :, None] * own[:, None, :])
-        level, psd = np.square(own[:, :readings]).sum(axis=1), np.arange(readings) // 2
+        level, psd = self._xp.sum(np.square(own[:, :readings]), 1), np.arange(readings) // 2
         coherent = alike[:, :readings, :readings][:, psd[:, None] != psd].max(axis=1)
         still = alike[:, readings:, readings:]
         electric = (still - np.eye(still.shape[1])).max(axis=(1, 2)) > _STILL_COHERENT

@@ -16,22 +16,9 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import result as module
+from psd_deflection.studies.check import wirings
 from psd_deflection.studies.check.checkup import CheckProblem, check, responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup, Levels, levels
-from psd_deflection.studies.check.wirings import (
-    WIRINGS,
-    Difference,
-    PushResponse,
-    differences,
-    fitting_wirings,
-    fix_of,
-    line,
-    on_channels,
-    parameters,
-    pattern,
-    scales_of,
-    wirings_of,
-)
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
 
 RIG = load_rig()
@@ -219,8 +206,8 @@ def push(
     sd: list[float] | None = None,
     only_twist: bool = False,
     scales: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0),
-) -> PushResponse:
-    return PushResponse(
+) -> wirings.PushResponse:
+    return wirings.PushResponse(
         loads,
         np.array(channels),
         np.array(sd or [1e-3] * 4),
@@ -234,12 +221,12 @@ def test_a_pattern_is_unknown_for_psds_at_the_base() -> None:
     rig = load_rig(overrides={'psd_1.zero': [0.002, -0.01], 'psd_2.zero': [0.01, 0.004]})
     # x_i = -X + ly θ, y_i = -Y - lx θ, of beams at (0 + 2, 70 - 10) and (-100 + 10, 0 + 4) mm.
     wanted = np.array([[-1, 0, 0.06], [0, -1, -0.002], [-1, 0, 0.004], [0, -1, 0.09]])
-    assert pattern(rig) == pytest.approx(wanted)
+    assert wirings.pattern(rig) == pytest.approx(wanted)
     base = load_rig(overrides={'solver': 'base_pair', 'psd_1.height': -0.5, 'psd_2.height': -0.4})
     with pytest.raises(ConfigError, match='PSDs at the base'):
-        pattern(base)
+        wirings.pattern(base)
     gains = load_rig(overrides={'psd_1.sensitivity': [4e-4, 6e-4], 'psd_2.sensitivity': [5e-4, 8e-4]})
-    assert scales_of(gains) == pytest.approx((0.8, 1.2, 1.0, 1.6))
+    assert wirings.scales_of(gains) == pytest.approx((0.8, 1.2, 1.0, 1.6))
 
 
 @pytest.mark.parametrize(
@@ -277,60 +264,66 @@ def test_unexplained_share_is_square_outside_pattern() -> None:
     assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).misfit(ROTATED) == pytest.approx((0.0, 1.0), abs=1e-12)
 
 
-def of_plate(*rows: tuple[str, float], lean: float = 0.0) -> list[PushResponse]:
+def of_plate(*rows: tuple[str, float], lean: float = 0.0) -> list[wirings.PushResponse]:
     """Pushes of so many m or rad that a plate answers to; ``lean``: share of a right angle's other axis."""
     plate = {'fx': [-1.0, 0.0, -1.0, 0.0], 'fy': [0.0, -1.0, 0.0, -1.0], 'tz': [0.07, 0.0, 0.0, 0.1]}
     other = {'fx': 'fy', 'fy': 'fx', 'tz': 'fx'}
     out = []
     for load, size in rows:
         moved = size * (np.array(plate[load]) + lean * np.array(plate[other[load]]))
-        out.append(PushResponse((load,), moved, np.full(4, 1e-6), np.array(plate[load])))
+        out.append(wirings.PushResponse((load,), moved, np.full(4, 1e-6), np.array(plate[load])))
     return out
 
 
 def test_three_pushes_leave_one_wiring_and_two_leave_several() -> None:
-    found = fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0), ('tz', 10.0)))
+    found = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0), ('tz', 10.0)))
     assert [(f.wiring, f.reversed_loads) for f in found] == [(PLAIN, ())]
     assert found[0].misfit == pytest.approx(0.0, abs=1e-12)
     # Along X and Y both PSDs move alike: they may be exchanged.
-    both = fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0)))
+    both = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0)))
     assert [f.wiring for f in both] == [PLAIN, Wiring(exchanged=True)]
-    assert fitting_wirings([]) != []
+    assert wirings.fitting_wirings([]) != []
     # The one load that went the other way, of two and of three.
     for rows in ([('fx', 1.0), ('tz', -10.0)], [('fx', 1.0), ('fy', 1.0), ('tz', -10.0)]):
-        assert {f.reversed_loads for f in fitting_wirings(of_plate(*rows))} <= {('tz',), ('fx',), ('fx', 'fy')}
+        assert {f.reversed_loads for f in wirings.fitting_wirings(of_plate(*rows))} <= {('tz',), ('fx',), ('fx', 'fy')}
 
 
 def test_wirings_have_two_wrong_psds_or_all_alike() -> None:
     nominal = Wiring(axes=(('x', 'y'),) * 3)
-    each = [wiring.axes[0] for wiring in WIRINGS[:64:8]]
+    each = [wiring.axes[0] for wiring in wirings.WIRINGS[:64:8]]
     all_of_three = set(itertools.product(each, repeat=3))
     few = {a for a in all_of_three if sum(axes != ('x', 'y') for axes in a) <= 2 or len(set(a)) == 1}
-    tried = wirings_of(nominal)
+    tried = wirings.wirings_of(nominal)
     assert len(tried) == len(set(tried)) == 4 * len(few)
     for swap in ((False, ()), (True, ()), (False, (1, 3)), (False, (2, 3))):
         assert {w.axes for w in tried if (w.exchanged, w.crossed) == swap} == few
     assert tried[0] == nominal
-    assert wirings_of(Wiring()) is WIRINGS
+    assert wirings.wirings_of(Wiring()) is wirings.WIRINGS
 
 
 def test_each_difference_has_the_line_that_puts_it_right() -> None:
-    right = parameters(ROTATED, PLAIN)
-    assert [fix_of(d, ROTATED, right) for d in differences(ROTATED, PLAIN)] == [
+    right = wirings.parameters(ROTATED, PLAIN)
+    assert [wirings.fix_of(d, ROTATED, right) for d in wirings.differences(ROTATED, PLAIN)] == [
         'psds_exchanged: true',
         'psd_1.axes: [-y, x]',
         'psd_1.axes: [-y, x]',
     ]
     # The file has x1 turned for PSD 1, and PSDs are exchanged: PSD 2, which is on input 1, is right as it is.
     now, file = Wiring(exchanged=True), Wiring(False, (('-x', 'y'), ('x', 'y')))
-    assert differences(now, file) == [Difference('psd_swap', 'psd_1 psd_2'), Difference('channel_sign', 'x1')]
-    assert fix_of(Difference('channel_sign', 'x1'), now, parameters(now, file)) == "psd_2.axes: [x, 'y']"
-    assert fix_of(Difference('channel_sign', 'y2'), now, {}) == "psd_1.axes: [x, 'y']"
+    assert wirings.differences(now, file) == [
+        wirings.Difference('psd_swap', 'psd_1 psd_2'),
+        wirings.Difference('channel_sign', 'x1'),
+    ]
+    assert (
+        wirings.fix_of(wirings.Difference('channel_sign', 'x1'), now, wirings.parameters(now, file))
+        == "psd_2.axes: [x, 'y']"
+    )
+    assert wirings.fix_of(wirings.Difference('channel_sign', 'y2'), now, {}) == "psd_1.axes: [x, 'y']"
     other = Wiring(True, (('x', '-y'), ('y', 'x')))
-    assert fix_of(Difference('channel_sign', 'x1'), other, {}) == "psd_2.axes: ['y', x]"
-    assert fix_of(Difference('channel_sign', 'x2'), other, {}) == 'psd_1.axes: [x, -y]'
-    assert line('a', 0.5) == 'a: 0.5'
-    assert line('a', False) == 'a: false'
+    assert wirings.fix_of(wirings.Difference('channel_sign', 'x1'), other, {}) == "psd_2.axes: ['y', x]"
+    assert wirings.fix_of(wirings.Difference('channel_sign', 'x2'), other, {}) == 'psd_1.axes: [x, -y]'
+    assert wirings.line('a', 0.5) == 'a: 0.5'
+    assert wirings.line('a', False) == 'a: false'
 
 
 STATED = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
@@ -340,11 +333,11 @@ PLATE = {'fx': [-1.0, 0.0, -1.0, 0.0], 'fy': [0.0, -1.0, 0.0, -1.0], 'tz': [0.07
 
 def push_of(
     load: str, size: float = 1.0, wiring: Wiring | None = None, *, sized: bool = True, sd: float = 1e-6
-) -> PushResponse:
+) -> wirings.PushResponse:
     """A movement of ``size`` times the expected one, some tenths of a millimetre, on the channels of ``wiring``."""
     expected = (1e-4 if load != 'tz' else 1e-3) * np.array(PLATE[load])
-    moved = on_channels(wiring or Wiring(), size * expected)
-    return PushResponse((load,), moved, np.full(4, sd), expected, sized=sized)
+    moved = wirings.on_channels(wiring or Wiring(), size * expected)
+    return wirings.PushResponse((load,), moved, np.full(4, sd), expected, sized=sized)
 
 
 THREE = [push_of('fx'), push_of('fy'), push_of('tz')]
@@ -362,7 +355,7 @@ def of_levels(
 
 
 def checked(
-    pushes: Sequence[PushResponse] = THREE,
+    pushes: Sequence[wirings.PushResponse] = THREE,
     levels: Levels | None = None,
     drift: Sequence[float] = (0.0,) * 4,
     drift_sd: float = 1e-9,
@@ -502,7 +495,7 @@ def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
         ),
     ],
 )
-def test_what_is_missing_is_asked_for(pushes: list[PushResponse], where: str, fix: str) -> None:
+def test_what_is_missing_is_asked_for(pushes: list[wirings.PushResponse], where: str, fix: str) -> None:
     found = checked(pushes)
     assert found.verdict == CANNOT_TELL
     assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [('load_coverage', where, None, fix)]

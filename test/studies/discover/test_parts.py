@@ -22,7 +22,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
-from psd_deflection.studies.discover import cleaning, conclusion, law_features, laws, plants, setup
+from psd_deflection.studies.discover import cleaning, conclusion, law_features, laws, plants, setup, steps
 from psd_deflection.studies.discover.hidden import FIRST, LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.noise import estimate_noise
 from psd_deflection.studies.discover.problem import Problem
@@ -34,16 +34,6 @@ from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Local
 from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.steps import (
-    alternatives,
-    fields_of,
-    predict,
-    search,
-    solve,
-    weigh,
-    where,
-    without_effect,
-)
 from psd_deflection.studies.loads.plate_motion import fine_means
 
 from .test_formulas import RIG, make_observation
@@ -301,7 +291,7 @@ def test_wild_values_count_as_six_deviations() -> None:
         assert cell.energy == pytest.approx(3600.0 * dof / 50.0 - dof)
 
 
-STEPS = (search, weigh, alternatives, where)
+STEPS = (steps.search, steps.weigh, steps.alternatives, steps.where)
 
 
 class Library(Lone):
@@ -349,18 +339,18 @@ def test_step_adds_results_and_changes_no_earlier_ones() -> None:
     assert len(weighed.heldout) == 2
     assert [n.active.effect.name for n in named.named] == [a.effect.name for a in weighed.fit.effects]
     assert (last.unknown, last.alternative_fits, last.unsettled) == ((), (), ())
-    fields = fields_of(last)
+    fields = steps.fields_of(last)
     assert (fields['verdict'], fields['effects'], fields['fit']) == ('effects_found', last.named, last.fit)
     assert fields['gap_after'] < fields['gap_before']
     assert [name for name, _ in fields['waterfall']] == ['as described', '+ a', '+ b', 'noise alone']
-    again = fields_of(solve(Library(Plant(shown, plant.measured[0])), STEPS, 0, lambda _: None))
+    again = steps.fields_of(steps.solve(Library(Plant(shown, plant.measured[0])), STEPS, 0, lambda _: None))
     assert (again['gap_after'], again['simulations']) == (fields['gap_after'], fields['simulations'])
 
 
 def test_nothing_is_missing_in_noise() -> None:
     shown = pictures(A, B)
-    last = solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
-    fields = fields_of(last)
+    last = steps.solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
+    fields = steps.fields_of(last)
     assert (fields['verdict'], last.named, last.fit) == ('nothing_missing', (), last.null)
     assert fields['gap_before'] == fields['gap_after'] == fields['gap_heldout_after']
 
@@ -369,13 +359,13 @@ def test_nothing_is_missing_in_noise() -> None:
 def test_predictions_are_asked_for_beyond_one_and_a_half_floors(level: float, asked: bool) -> None:
     words: list[str] = []
     first = Problem.of(Library(Plant(pictures(A, B), level * noise())), 0, words.append, np.random.default_rng(0))
-    searched = search(first)
+    searched = steps.search(first)
     assert first.comparison.gap(searched.fit.difference) == pytest.approx(level * first.comparison.floor(), rel=0.1)
-    after = predict(searched)
+    after = steps.predict(searched)
     assert ('predicting' in words) is (after.predictive is not None) is asked
     # What is unknown is asked for, however little.
     unknown = dataclasses.replace(searched, unknown=(weighing.Unknown('x', (), 0.1),))
-    assert predict(unknown).predictive is not None
+    assert steps.predict(unknown).predictive is not None
 
 
 def test_unexplained_remainder_drops_weak_effects() -> None:
@@ -384,12 +374,12 @@ def test_unexplained_remainder_drops_weak_effects() -> None:
     # Faster than blocks, so that no gap has it.
     fast = Cell('x1', 0, (0.0, 1.0), (25.0, 60.0), (), 9.0, 0.0, 900.0)
     left = nowhere(p=0.0, excess=900.0, cells=(fast,))
-    last = solve(Library(plant, left), STEPS, 0, lambda _: None)
-    assert (fields_of(last)['verdict'], names(last.fit), last.residual) == ('unknown_effect', [], left)
+    last = steps.solve(Library(plant, left), STEPS, 0, lambda _: None)
+    assert (steps.fields_of(last)['verdict'], names(last.fit), last.residual) == ('unknown_effect', [], left)
     assert last.search.trace[-1].endswith('explains less than what remains unknown')
     strong = Plant(shown, without_noise((shown[A], 2000.0)) + noise())
-    kept = solve(Library(strong, left), STEPS, 0, lambda _: None)
-    assert (fields_of(kept)['verdict'], names(kept.fit)) == ('unknown_effect', ['a'])
+    kept = steps.solve(Library(strong, left), STEPS, 0, lambda _: None)
+    assert (steps.fields_of(kept)['verdict'], names(kept.fit)) == ('unknown_effect', ['a'])
 
 
 @pytest.mark.parametrize(('of_effect', 'found'), [(0.0, ['link_length']), (0.3, ['b', 'c'])])
@@ -405,7 +395,7 @@ def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, found: Se
         plant = Plant(shown, without_noise((shown[b], total), (shown[c], 500.0)) + noise())
     else:
         plant = Plant(shown, without_noise((shown[length], total)) + noise())
-    after = search(begun(Library(plant)))
+    after = steps.search(begun(Library(plant)))
     assert names(after.fit) == found
     assert after.comparison.first == (frozenset() if of_effect else FIRST)
     assert plant.first == FIRST
@@ -414,21 +404,21 @@ def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, found: Se
 def test_others_are_refitted_without_removed_effect() -> None:
     shown = pictures(A, B)
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
-    both = weigh(search(begun(Library(plant))))
+    both = steps.weigh(steps.search(begun(Library(plant))))
     at = [a.effect.name for a in both.fit.effects].index('a')
-    one = without_effect(both, at, 'is not wanted')
+    one = steps.without_effect(both, at, 'is not wanted')
     assert names(one.fit) == ['b']
     assert one.heldout == (both.heldout[1 - at],)
     assert len(one.result.delta_chi2) == 1
     assert one.result.fit is both.fit
     assert one.search.trace[-1] == 'a is not wanted'
-    none = without_effect(one, 0, 'neither')
+    none = steps.without_effect(one, 0, 'neither')
     assert none.fit is one.result.null
 
 
 def test_gap_before_is_that_of_original_recording() -> None:
     shown = pictures(A)
-    last = solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
+    last = steps.solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
     assert dataclasses.replace(last, stated_gap=7.0).gap_before == 7.0
     assert last.gap_before == last.bare.gap(last.null.difference)
 
