@@ -290,6 +290,9 @@ def test_channels_that_never_change_report_by_their_levels() -> None:
     samples[:, 0] = 0.0
     np.testing.assert_allclose(fed(samples).steps, [0.0, *[TEN] * 5], rtol=1e-5)
     assert not fed(np.full((1000, 6), 2.5, np.float32)).steps.any()
+    # First every fourth level, then what lies between: none of it fits the steps so far.
+    steps = np.concatenate((4.0 * np.arange(500), 2.0 * np.arange(500) + 1.0))
+    np.testing.assert_allclose(fed(np.tile(TEN * steps[:, None], 6).astype(np.float32)).steps, TEN, rtol=1e-5)
 
 
 @pytest.mark.parametrize('noise', [1.0, 0.0])
