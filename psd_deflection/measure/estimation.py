@@ -16,9 +16,10 @@ from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
 from psd_deflection.measure.solving import BlockReadings, Dots, ReadingsRun, SolverAnswer, SolverSet
 from psd_deflection.measure.state import State, Value, numbers
 from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
-from psd_deflection.measure.uncertainty.block_fit import FittedRun
+from psd_deflection.measure.uncertainty.block_fit import FittedBlock
 from psd_deflection.measure.uncertainty.consistency import ConsistencyResult, Unexplained, widened
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
+from psd_deflection.measure.uncertainty.vibration import Tone
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.misalignment.rig import ParameterCovariance
 from psd_deflection.model.plate import Geometry
@@ -65,10 +66,11 @@ class HeldTwist(NamedTuple):
 
 
 class SolvedReadings(NamedTuple):
-    """Readings and the primary solver's solution; nothing of the state has changed yet.
+    """Readings with the primary solver's solution, None for the reason in ``failure``.
 
-    ``failure``: why there is no solution. ``factor`` (C, k) m: square root of what the calibration's uncertainty adds
-    to the dots' covariance, None if nothing. ``unexplained``: what no pose explains of the readings.
+    ``factor`` (C, k) m: square root of what the calibration's uncertainty adds to the dots' covariance, None if
+    nothing. ``unexplained``: what no pose explains of the readings. ``checked``: None until the check of their PSDs is
+    updated, and for readings that cannot be checked. ``excluded``: the PSD (from 1) that contradicts these readings.
     """
 
     readings: BlockReadings
@@ -76,17 +78,7 @@ class SolvedReadings(NamedTuple):
     failure: str = ''
     factor: FloatArray | None = None
     unexplained: Unexplained | None = None
-
-
-class CheckedReadings(NamedTuple):
-    """What an estimate is made from. ``checked``: None if the readings cannot be checked.
-
-    ``factor``: as of :class:`SolvedReadings`. ``excluded``: the PSD (from 1) that contradicts these readings.
-    """
-
-    readings: BlockReadings
-    factor: FloatArray | None
-    checked: ConsistencyResult | None
+    checked: ConsistencyResult | None = None
     excluded: int = 0
 
 
@@ -98,7 +90,7 @@ class BlockSolution(NamedTuple):
     """
 
     dots: Dots
-    used: CheckedReadings | None = None
+    used: SolvedReadings | None = None
     estimate: DeflectionEstimate | None = None
     failure: Failure | None = None
 
@@ -181,11 +173,11 @@ class Estimation:
         variances = self.variances[0]
         return self.primary.gain(at_rest, variances, self.primary.solve(at_rest, variances))
 
-    def vibration(self) -> tuple[FloatArray, FloatArray]:
-        """Covariance (3, 3) of what vibrates too fast for a block: of the pose and of its rate, in SI units."""
+    def vibration(self, tones: Sequence[Tone]) -> tuple[FloatArray, FloatArray]:
+        """Return the covariance (3, 3) that ``tones`` give the pose, and that of its rate, in SI units."""
         gain = self.gain_at_rest()
         pose, rate = np.zeros((3, 3)), np.zeros((3, 3))
-        for tone in self.estimator.vibrating:
+        for tone in tones:
             own = self._xp.einsum('ic,cd,jd->ij', gain, tone.covariance, gain)
             pose += own
             rate += self._xp.square(2.0 * pi * tone.frequency * self._rig.converter.sample_rate_hz) * own
@@ -195,32 +187,38 @@ class Estimation:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""
         return self.estimator.mean_variances(size) if self.estimator.on_plate else self.variances[-1]
 
-    def fits(self, blocks: Sequence[ValidBlock]) -> Iterator[BlockReadings]:
-        """Yield all readings, fitted, of each block whose verdict is OK; those with the same places are computed
-        together.
-        """
-        good = [block for block in blocks if block.verdict.status is BlockStatus.OK]
-        for _, same in itertools.groupby(good, key=lambda block: block.slots.tobytes()):
-            together = list(same)
-            slots, samples = together[0].slots, np.stack([own.samples for own in together])
-            fitted: FittedRun | None = None
-            for own, at in self.estimator.fits(self.estimator.full, slots, samples):
-                if own is not fitted:
-                    fitted, variances = own, self.variances[len(slots) - 1]
-                    run = ReadingsRun(self._solvers, self.estimator.full, own.dots, variances, own.covariance)
-                yield BlockReadings(run, at)
+    def fit(self, blocks: Sequence[ValidBlock]) -> list[BlockReadings | None]:
+        """Return all readings of each block, fitted; None for a block whose verdict is not OK. The state stays.
 
-    def solve(self, block: ValidBlock, fits: Iterator[BlockReadings]) -> BlockSolution:
+        Blocks that have the same samples are computed together.
+        """
+        fit = self.estimator.full.fit
+        memory = fit.memory
+        fitted: list[BlockReadings | None] = []
+        for (ok, _), same in itertools.groupby(blocks, _computed_alike):
+            together = list(same)
+            if not ok:
+                fitted += [None] * len(together)
+                continue
+            slots = together[0].slots
+            for run in fit.fit_blocks(slots, np.stack([block.samples for block in together]), memory):
+                memory = run.memories[-1]
+                variances = self.variances[len(slots) - 1]
+                readings = ReadingsRun(self._solvers, self.estimator.full, run.dots, variances, run.covariance)
+                fitted += [BlockReadings(readings, at, run.block(at)) for at in range(len(run.dots))]
+        return fitted
+
+    def solve(self, block: ValidBlock, readings: BlockReadings | None) -> BlockSolution:
         """Return the primary solver's estimate of a block whose verdict is OK or names sound detectors.
 
-        ``fits``: as :meth:`fits` has them, from this block on.
+        ``readings``: as :meth:`fit` returns them.
         """
         verdict = block.verdict
         variances = self._with_light(block, self.variances[len(block.slots) - 1])
-        if verdict.status is BlockStatus.OK:
-            readings = next(fits)
+        if readings is not None:
+            self.estimator.full.fit.memory = readings.fitted.memory
             if verdict.findings:
-                readings = self._readings(readings.psds, readings.dots, readings.covariance, block, variances)
+                readings = self._readings(readings.psds, readings.fitted, block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
             variances = self._with_light(block, self.estimator.mean_variances(len(block.slots)))
@@ -230,14 +228,14 @@ class Estimation:
         estimate = self._from_one(verdict.sound[0], block, variances) if len(verdict.sound) == 1 else None
         return BlockSolution(block.means, None, estimate)
 
-    def other_estimates(self, block: ValidBlock, used: CheckedReadings) -> Iterator[DeflectionEstimate]:
+    def other_estimates(self, block: ValidBlock, used: SolvedReadings) -> Iterator[DeflectionEstimate]:
         """Yield the estimates of the other solvers."""
         for number in range(1, len(self._solvers.names)):
             answer = used.readings.answer(number)
             if answer.solution is not None:
-                yield self._estimate(number, block, answer.solution, answer, used)
+                yield self._estimate(number, block, answer.solution, self._covariance(answer, used))
 
-    def excluded(self, used: CheckedReadings | None) -> tuple[int, ...]:
+    def excluded(self, used: SolvedReadings | None) -> tuple[int, ...]:
         """Return the PSDs (from 1) without which a block was solved."""
         if used is None:
             return ()
@@ -253,17 +251,17 @@ class Estimation:
         solved, own = self._solved(readings), readings.psds
         may_exclude = len(own.psds) > 2 and self._rig.estimator.consistency != 'report' and self.estimator.on_plate
         if solved.solution is None or not may_exclude:
-            return self._finish(block, dots, solved, self._check(solved, None))
+            return self._finish(block, dots, self._checked(solved, None))
         numbers = own.check.candidates(solved.unexplained, self.estimator.limit_factor)
         subsets = {number: self._solved_without(number, block, variances, own) for number in numbers}
-        checked = self._check(solved, [number for number, subset in subsets.items() if self._agrees(subset)])
-        number = self._to_exclude(block, own, checked)
+        solved = self._checked(solved, [number for number, subset in subsets.items() if self._agrees(subset)])
+        number = self._to_exclude(block, own, solved.checked)
         if number and number not in subsets:
             subsets[number] = self._solved_without(number, block, variances, own)
         without = subsets[number] if number else None
         if without is None:
-            return self._finish(block, dots, solved, checked)
-        return self._finish(block, dots, without, self._check(without, None), own.psds[number - 1] + 1)
+            return self._finish(block, dots, solved)
+        return self._finish(block, dots, self._checked(without, None)._replace(excluded=own.psds[number - 1] + 1))
 
     def _solved(self, readings: BlockReadings) -> SolvedReadings:
         solution, failure, *_ = readings.answer(0)
@@ -301,11 +299,11 @@ class Estimation:
             found = self._unexplained(readings, solved.solution, readings.covariance)
         return readings.psds.check.agrees(found, self.estimator.limit_factor)
 
-    def _check(self, solved: SolvedReadings, blamed: Collection[int] | None) -> ConsistencyResult | None:
-        """Update the check of a set of PSDs with a block; None if the readings cannot be checked."""
+    def _checked(self, solved: SolvedReadings, blamed: Collection[int] | None) -> SolvedReadings:
+        """Update the check of a set of PSDs with a block, and return its readings with the result."""
         if solved.solution is None or not self.estimator.on_plate:
-            return None
-        return self.estimator.check(solved.readings.psds, solved.unexplained, blamed)
+            return solved
+        return solved._replace(checked=self.estimator.check(solved.readings.psds, solved.unexplained, blamed))
 
     def _to_exclude(self, block: ValidBlock, psds: PsdSet, checked: ConsistencyResult | None) -> int:
         """Return the PSD to exclude, from 1 among ``psds``; 0: none."""
@@ -315,35 +313,32 @@ class Estimation:
         still = [n for n, psd in enumerate(psds.psds, 1) if block.frozen[psd] >= FROZEN_BLOCKS]
         return still[0] if len(still) == 1 else 0
 
-    def _finish(
-        self,
-        block: ValidBlock,
-        dots: Dots,
-        solved: SolvedReadings,
-        checked: ConsistencyResult | None,
-        excluded: int = 0,
-    ) -> BlockSolution:
-        """Return the estimate from ``solved``, or why there is none; ``excluded``: the PSD (from 1) that it lacks."""
-        used = CheckedReadings(solved.readings, solved.factor, checked, excluded)
-        if solved.solution is None:
-            return BlockSolution(dots, used, None, (BlockStatus.NOT_SOLVED, solved.failure))
+    def _finish(self, block: ValidBlock, dots: Dots, used: SolvedReadings) -> BlockSolution:
+        """Return the estimate from ``used``, or why there is none; remember its twist and systematic covariance."""
+        checked = used.checked
+        if used.solution is None:
+            return BlockSolution(dots, used, None, (BlockStatus.NOT_SOLVED, used.failure))
         contradict = checked is not None and checked.contradict and not checked.excluded
         if checked is not None and contradict and self._rig.estimator.consistency == 'reject':
             words = 'four readings' if len(self._rig.psds) == 2 else 'readings'
             reason = f'the {words} contradict each other: chi-square {checked.chi_square:.0f} of {checked.freedom}'
             return BlockSolution(dots, used, None, (BlockStatus.INCONSISTENT, reason))
-        self.systematic = None
-        estimate = self._estimate(0, block, solved.solution, solved.readings.answer(0), used)
+        answer = used.readings.answer(0)
+        covariance = self._covariance(answer, used)
+        estimate = self._estimate(0, block, used.solution, covariance, used.checked)
         self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
+        self.systematic = None
+        if covariance is not None and answer.noise is not None and covariance is not answer.noise:
+            self.systematic = covariance - answer.noise
         return BlockSolution(dots, used, estimate)
 
     def _readings(
-        self, psds: PsdSet, dots: Dots, covariance: FloatArray, block: ValidBlock, variances: tuple[float, ...]
+        self, psds: PsdSet, fitted: FittedBlock, block: ValidBlock, variances: tuple[float, ...]
     ) -> BlockReadings:
-        """Return the fitted ``dots`` (C,) of ``psds`` as readings; ``variances`` (2P,) m^2 of all PSDs."""
+        """Return the fit of ``psds`` as readings of a block with findings; ``variances`` (2P,) m^2 of all PSDs."""
         own = tuple([variances[i] for i in psds.columns])
-        covariance = self._covariance_of(block, covariance, psds.columns)
-        return BlockReadings(ReadingsRun(self._solvers, psds, [dots], own, covariance[None]), 0)
+        covariance = self._covariance_of(block, fitted.covariance, psds.columns)
+        return BlockReadings(ReadingsRun(self._solvers, psds, [fitted.dots], own, covariance[None]), 0, fitted)
 
     def _subset(self, psds: tuple[int, ...], block: ValidBlock, variances: tuple[float, ...]) -> BlockReadings | None:
         """Return the readings of ``psds`` (from 0) alone; None if the primary method cannot do with them."""
@@ -351,16 +346,20 @@ class Estimation:
         if solver is None:
             return None
         own = self.estimator.subset(psds, solver.tilts)
-        run, at = next(self.estimator.fits(own, block.slots, block.samples[None]))
-        return self._readings(own, run.dots[at], run.covariance[at], block, variances)
+        return self._readings(own, own.fit.fit(block.slots, block.samples[:, own.columns]), block, variances)
 
     def _estimate(
-        self, number: int, block: ValidBlock, s: Solution, answer: SolverAnswer, used: CheckedReadings
+        self,
+        number: int,
+        block: ValidBlock,
+        s: Solution,
+        covariance: FloatArray | None,
+        checked: ConsistencyResult | None = None,
     ) -> DeflectionEstimate:
-        primary, checked = number == 0, used.checked
-        covariance: tuple[float, ...] = s.covariance
-        if answer.gain is not None and answer.noise is not None:
-            covariance = self._covariance(primary, answer.gain, answer.noise, used)
+        """Return the estimate of solver ``number`` from its solution.
+
+        ``covariance`` (3, 3), None for the solution's own. ``checked``: of the primary solver's readings.
+        """
         return DeflectionEstimate(
             t_ns=block.t_ns,
             block=block.index,
@@ -370,25 +369,23 @@ class Estimation:
             theta=s.theta,
             phi=s.phi,
             omega=s.omega,
-            covariance=covariance,
+            covariance=s.covariance if covariance is None else tuple(covariance.ravel().tolist()),
             residual_rms=self._xp.root(self._xp.total([r * r for r in s.residual]) / len(s.residual)),
-            primary=primary,
-            chi_square=checked.chi_square if primary and checked is not None and checked.freedom else nan,
+            primary=number == 0,
+            chi_square=checked.chi_square if checked is not None and checked.freedom else nan,
             on_own_topic=block.due,
         )
 
-    def _covariance(
-        self, primary: bool, gain: FloatArray, noise: FloatArray, used: CheckedReadings
-    ) -> tuple[float, ...]:
-        """Return the covariance of a solution; ``noise`` (3, 3): by the noise of the readings alone."""
-        own, checked = noise, used.checked
+    def _covariance(self, answer: SolverAnswer, used: SolvedReadings) -> FloatArray | None:
+        """Return the covariance (3, 3) of an answer by noise, calibration and check; None if it has no noise."""
+        if answer.gain is None or answer.noise is None:
+            return None
+        own, checked = answer.noise, used.checked
         if used.factor is not None:
-            own = own + _through(gain, used.factor, self._xp)
+            own = own + _through(answer.gain, used.factor, self._xp)
         if checked is not None and self._rig.estimator.consistency == 'widen' and any(checked.possible):
-            own = widened(own, gain, checked.possible, self._xp)
-        if primary and own is not noise:
-            self.systematic = own - noise
-        return tuple(own.ravel().tolist())
+            own = widened(own, answer.gain, checked.possible, self._xp)
+        return own
 
     def _covariance_of(self, block: ValidBlock, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
         """Return the fit's covariance (C, C) of the readings ``columns``, widened as in :meth:`_with_light`."""
@@ -444,6 +441,11 @@ class Estimation:
             primary=True,
             on_own_topic=block.due,
         )
+
+
+def _computed_alike(block: ValidBlock) -> tuple[bool, bytes]:
+    """Return whether a block is fitted, and which samples it has."""
+    return block.verdict.status is BlockStatus.OK, block.slots.tobytes()
 
 
 def _through(gain: FloatArray, factor: FloatArray, xp: Arithmetic) -> FloatArray:

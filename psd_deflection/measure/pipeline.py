@@ -20,7 +20,7 @@ from psd_deflection.measure.motion.modal import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
 from psd_deflection.measure.solving import BlockReadings, Dots
 from psd_deflection.measure.state import FULL, STATE, Part, State, Value, load_states, numbers
-from psd_deflection.measure.uncertainty.vibration import why_moving
+from psd_deflection.measure.uncertainty.vibration import Tone, why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.tip_load import TipLoads
@@ -48,8 +48,10 @@ from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.declarations import ZEROS
 
 ZERO_BLOCKS = 25
-ZERO_KEPT_S = 15.0
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
+
+ZERO_KEPT_S = 15.0
+"""How old, s, the request for a zero may be: the dots of so long are kept."""
 
 
 def zero_variances(rig: Rig) -> tuple[float, ...]:
@@ -343,7 +345,7 @@ class Pipeline:
         return self._corrected(block, samples, volts[:, 2::3].astype(np.float64))
 
     def _together(self, blocks: Sequence[SampleBlock]) -> Iterator[Record]:
-        """The records of ``blocks`` of one length; a change in between holds from the next block on."""
+        """The records of ``blocks`` of one length; what changes in between holds from the next block on."""
         while blocks:
             first = blocks[0]
             if self._correction.uses_time and START not in self._surroundings.known:
@@ -353,26 +355,26 @@ class Pipeline:
             samples = [self._dots(block, own) for block, own in zip(blocks, volts, strict=True)]
             measures = measured(volts, samples)
             observed = list(self._classified(blocks, measures))
-            fits = self.estimation.fits(observed)
+            readings = self.estimation.fit(observed)
             done = 0
-            for own in zip(blocks, measures, observed, strict=True):
-                yield from self._block(*own, fits)
+            for own in zip(blocks, measures, observed, readings, strict=True):
+                yield from self._block(*own)
                 done += 1
                 if self._changes != changes:
                     break
             blocks = blocks[done:]
 
     def _block(
-        self, block: SampleBlock, measures: BlockMeasures, observed: ValidBlock, fits: Iterator[BlockReadings]
+        self, block: SampleBlock, measures: BlockMeasures, observed: ValidBlock, readings: BlockReadings | None
     ) -> Iterator[Record]:
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
         self._stillness.blocks = observed.frozen
         verdict = observed.verdict
         solvable = verdict.status is BlockStatus.OK or verdict.sound
-        answer = self.estimation.solve(observed, fits) if solvable else BlockSolution(observed.means)
+        answer = self.estimation.solve(observed, readings) if solvable else BlockSolution(observed.means)
         self.last_estimate = answer.estimate
-        self.estimator.excluded = self.estimation.excluded(answer.used)
+        self.estimator.record(answer.used and answer.used.readings.fitted, self.estimation.excluded(answer.used))
         status, reason = answer.failure or (verdict.status, verdict.reason)
         self._count(status, verdict, answer)
         yield from self._estimates(observed, answer, status)
@@ -437,7 +439,9 @@ class Pipeline:
         if self.motion_filter is not None:
             # A pose without all PSDs has other noise than the filter is set for: it predicts only.
             usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and answer.complete)
-            moved = self._moved(self.motion_filter, observed, usable)
+            # A block without a fit does not say which tones it follows.
+            tones = self.estimator.noise.tones if used is None else self.estimator.vibrating
+            moved = self._moved(self.motion_filter, observed, usable, tones)
             if moved is not None:
                 yield moved
         self._keep_for_zero(observed, answer)
@@ -478,11 +482,16 @@ class Pipeline:
     def _learn(self, observed: ValidBlock, measures: BlockMeasures) -> None:
         """Update the measured noise with a good block, and the filter with the noise."""
         changed = self.estimator.learn(observed.index, observed.slots, observed.samples, measures.volts)
-        if changed and self.motion_filter is not None:
+        if not changed:
+            return
+        self._changes += 1
+        if self.motion_filter is not None:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
 
-    def _moved(self, motion: ModalFilter, observed: ValidBlock, usable: bool) -> TipMotion | None:
-        """The motion by the filter; ``usable``: whether samples of the block can be used."""
+    def _moved(
+        self, motion: ModalFilter, observed: ValidBlock, usable: bool, tones: Sequence[Tone]
+    ) -> TipMotion | None:
+        """The motion by the filter; ``usable``: whether samples of the block can be used; ``tones``: not followed."""
         slots, poses = observed.slots, None
         if usable:
             solved = self.estimation.primary.solve_many(observed.samples, np.array(self.estimation.variances[0]))
@@ -495,8 +504,8 @@ class Pipeline:
         systematic = self.estimation.systematic
         covariance = moved.covariance if systematic is None else moved.covariance + systematic
         velocity_covariance = moved.velocity_covariance
-        if self.estimator.vibrating:
-            pose, rate = self.estimation.vibration()
+        if tones:
+            pose, rate = self.estimation.vibration(tones)
             covariance, velocity_covariance = covariance + pose, velocity_covariance + rate
         dx, dy, theta = moved.pose.tolist()
         vx, vy, vtheta = moved.velocity.tolist()

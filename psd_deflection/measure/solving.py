@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
+from psd_deflection.measure.uncertainty.block_fit import FittedBlock
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
@@ -137,24 +138,25 @@ def _has_gain(solution: Solution) -> bool:
 
 
 class BlockReadings(NamedTuple):
-    """Readings of one block that are solved together: those of block ``at`` (from 0) of ``run``."""
+    """Readings of one block that are solved together: those of block ``at`` (from 0) of ``run``, and their fit."""
 
     run: ReadingsRun
     at: int
+    fitted: FittedBlock
 
     @property
     def psds(self) -> PsdSet:
-        """Whose they are."""
+        """The PSDs that have these readings."""
         return self.run.psds
 
     @property
     def dots(self) -> Dots:
         """(C,) m at the stamp."""
-        return self.run.dots[self.at]
+        return self.fitted.dots
 
     @property
     def covariance(self) -> FloatArray:
-        """(C, C) m^2 of the dots."""
+        """(C, C) m^2 of the dots: of the fit, and of missing or foreign light."""
         return np.asarray(self.run.covariance[self.at])
 
     def answer(self, number: int) -> SolverAnswer:

@@ -184,3 +184,21 @@ def rotate(a: FloatArray, vectors: FloatArray, i: int, j: int) -> None:
         rows[i] = c * first - s * second
         rows[j] = s * first + c * second
     a[i, j] = a[j, i] = 0.0
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of positive definite ``matrices`` (n, k, k), by elimination; no pivots are needed.
+
+    Element by element, so that the bits are those of any machine.
+    """
+    size = matrices.shape[1]
+    out = matrices.copy()
+    for i in range(size):
+        pivot = 1.0 / out[:, i, i]
+        row = out[:, i, :] * pivot[:, None]
+        column = out[:, :, i].copy()
+        out -= column[:, :, None] * row[:, None, :]
+        out[:, i, :] = row
+        out[:, :, i] = -column * pivot[:, None]
+        out[:, i, i] = pivot
+    return out

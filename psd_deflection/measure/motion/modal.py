@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic.matrices import inverse
 from psd_deflection.measure.state import mismatch
-from psd_deflection.measure.uncertainty.block_fit import inverse
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
 
 

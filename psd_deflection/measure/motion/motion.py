@@ -20,12 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
+from psd_deflection.base.arithmetic.matrices import inverse
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.motion.inertia import Forced, Inertia
 from psd_deflection.measure.motion.modal import BlockTables, KnownLoads, Oscillator, Pushed, joined_ns, split_ns
 from psd_deflection.measure.motion.unseen import Innovations, UnseenLoads
 from psd_deflection.measure.state import State, Value, mismatch, numbers
-from psd_deflection.measure.uncertainty.block_fit import LARGEST, inverse
+from psd_deflection.measure.uncertainty.block_fit import LARGEST
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 

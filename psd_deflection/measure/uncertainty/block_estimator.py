@@ -8,13 +8,13 @@ of PSDs (:mod:`psd_deflection.measure.uncertainty.psd_set`), and knows their sta
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.measure.state import State, Value, mismatch, numbers
-from psd_deflection.measure.uncertainty.block_fit import FittedRun
+from psd_deflection.measure.uncertainty.block_fit import FittedBlock
 from psd_deflection.measure.uncertainty.combinations import Residual
 from psd_deflection.measure.uncertainty.consistency import UNMEASURED, ConsistencyResult, Unexplained, survival
 from psd_deflection.measure.uncertainty.noise import StreamNoise
@@ -219,16 +219,12 @@ class BlockEstimator:
                 own.load_state(self._pending.pop(psds))
         return own
 
-    def fits(self, psds: PsdSet, slots: IntArray, samples: FloatArray) -> Iterator[tuple[FittedRun, int]]:
-        """Yield the fit of ``psds`` for each block: the run that it was computed with, and its place there.
-
-        ``slots`` (n,): which samples are present; ``samples`` (B, n, 2P), m, of all PSDs.
-        """
-        for run, at in psds.fits(slots, samples):
-            self.misfits += run.misfit[at]
-            tones = self.noise.tones
-            self.vibrating = tuple(tones[i] for i in run.vibrating[at])
-            yield run, at
+    def record(self, fitted: FittedBlock | None, excluded: tuple[int, ...]) -> None:
+        """Take what the last block was solved from: its fit, None without one, and the PSDs (from 1) not used."""
+        self.excluded, self.vibrating = excluded, ()
+        if fitted is not None:
+            self.misfits += fitted.misfit
+            self.vibrating = tuple(self.noise.tones[i] for i in fitted.vibrating)
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
         """Return the variances (C,), m^2, of the mean of so many samples of each reading."""

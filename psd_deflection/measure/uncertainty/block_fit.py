@@ -21,14 +21,14 @@ The readings are turned into orthogonal combinations first (:mod:`psd_deflection
 that motion is sought where the link moves the dots.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
-from psd_deflection.base.arithmetic.matrices import AT_ONCE
+from psd_deflection.base.arithmetic.matrices import AT_ONCE, inverse
 from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.measure.uncertainty.vibration import MATTERS, Tone
 from psd_deflection.records import FloatArray, IntArray
@@ -71,28 +71,38 @@ _WIDEN = 1.0
 """Times what is left of the samples: the standard deviation of a misfit's error in the middle."""
 
 
-class Fitted(NamedTuple):
+class MotionMemory(NamedTuple):
+    """What is known of the motion after a block. ``recent`` (2, K, C): running mean of c_k^2 less its noise, m^2, and
+    its weight; ``lasting`` (2, K, C): mean of motion that goes on alike, m^2, and over how many blocks.
+    """
+
+    recent: FloatArray
+    lasting: FloatArray
+
+
+class FittedBlock(NamedTuple):
     """``dots`` (C,) m at the stamp, their ``covariance`` (C, C) m^2, ``misfit``: the polynomial does not fit,
-    ``vibrating``: which tones, from 0, are a share of ``MATTERS`` of the covariance."""
+    ``vibrating``: which tones, from 0, are a share of ``MATTERS`` of the covariance, ``memory``: after this block."""
 
     dots: tuple[float, ...]
     covariance: FloatArray
     misfit: bool
     vibrating: tuple[int, ...]
+    memory: MotionMemory
 
 
 class FittedRun(NamedTuple):
-    """B blocks that were fitted together: ``dots``, ``covariance`` (B, C, C), ``misfit``, ``vibrating`` of each as of
-    :class:`Fitted`."""
+    """B blocks that were fitted together: of each what a :class:`FittedBlock` has; ``covariance`` (B, C, C)."""
 
     dots: list[tuple[float, ...]]
     covariance: FloatArray
     misfit: list[bool]
     vibrating: list[tuple[int, ...]]
+    memories: Sequence[MotionMemory]
 
-    def block(self, at: int) -> Fitted:
-        """The fit of block ``at`` (from 0)."""
-        return Fitted(self.dots[at], self.covariance[at], self.misfit[at], self.vibrating[at])
+    def block(self, at: int) -> FittedBlock:
+        """Return the fit of block ``at`` (from 0)."""
+        return FittedBlock(self.dots[at], self.covariance[at], self.misfit[at], self.vibrating[at], self.memories[at])
 
 
 def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
@@ -127,14 +137,14 @@ class _Vibration(NamedTuple):
 
 
 class _Terms(NamedTuple):
-    """What the samples that are present say of the coefficients, for K orders of which ``reported`` can be determined.
+    """What the n samples that are present say of the coefficients of K orders, of which they determine the first R.
 
-    ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (told, C):
-    variances of the first ones; ``sure`` (told, C): how much a block says of them, 1 of a whole one.
-    ``all`` (n, K + told + n, C): u, u times the covariance of the first ones, precision. ``used``: orders above 0 that
-    the middle needs. Once order 0, of which nothing is known beforehand, is taken out: ``rest`` (k, k, C) and
-    ``right`` (k, C) are the equations of those; ``first`` (C,) and ``share`` (k, C) give its weight from theirs.
-    ``together`` (C, told - 1, told - 1): covariances of the first ones but order 0.
+    ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (R, C):
+    variances of the first R; ``sure`` (R, C): how much a block says of them, 1 of a whole one. ``all``
+    (n, K + R + n, C): u, u times the covariance of the first R, precision. ``used``: orders above 0 that the middle
+    needs. Once order 0, of which nothing is known beforehand, is taken out: ``rest`` (k, k, C) and ``right`` (k, C)
+    are the equations of those; ``first`` (C,) and ``share`` (k, C) give its weight from theirs. ``together``
+    (C, R - 1, R - 1): covariances of orders 1 to R - 1.
     """
 
     q: FloatArray
@@ -174,20 +184,10 @@ def _terms(
     return _Terms(q, u, information, v, sure, every, used, rest, right, middle[0] / own, share, inverted[:, 1:, 1:])
 
 
-class _Memory(NamedTuple):
-    """What is known of motion after a block. ``recent`` (2, K, C): running mean of c_k^2 less its noise, m^2, and its
-    weight; ``lasting`` (2, K, C): mean of what goes on alike, m^2, and over how many blocks.
-    """
-
-    recent: FloatArray
-    lasting: FloatArray
-
-
 class BlockFit:
-    """Fits blocks in turn; see the module's text. Its state is how much motion there was.
+    """Fits blocks with the present noise; see the module's text. ``memory``: of the motion before the next block.
 
-    Blocks with the same places are computed together, as far as the noise stays the same; the bits of a block do not
-    depend on that.
+    The bits of a block do not depend on how many are computed together.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ class BlockFit:
         self._diagonal = np.arange(self._count)
         nothing = np.zeros((self._orders, self._count))
         # Until motion is seen there was none.
-        self._memory = _Memory(np.stack((nothing, nothing + 1.0)), np.stack((nothing, nothing + 1.0 / _FORGET)))
+        self.memory = MotionMemory(np.stack((nothing, nothing + 1.0)), np.stack((nothing, nothing + 1.0 / _FORGET)))
         self.set_geometry(centers, beams, slopes)
 
     def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
@@ -250,33 +250,33 @@ class BlockFit:
         both = residual[:, :, None] * residual[:, None, :] + sine[:, :, None] * sine[:, None, :]
         return np.asarray(vibration.covariance * both)
 
-    def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
-        """The dots at the middle of one block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
-        run, at = next(self.fits(slots, dots[None]))
-        return run.block(at)
+    def fit(self, slots: IntArray, dots: FloatArray) -> FittedBlock:
+        """Return the fit of one block, and remember its motion.
 
-    def fits(self, slots: IntArray, dots: FloatArray) -> Iterator[tuple[FittedRun, int]]:
-        """The fit of each of B blocks: the run that it was computed with, and its place there.
+        ``slots`` (n,): which samples are present. ``dots`` (n, C), m.
+        """
+        (run,) = self.fit_blocks(slots, dots[None])
+        self.memory = run.memories[0]
+        return run.block(0)
 
-        ``slots`` (n,): which samples the blocks have. ``dots`` (B, n, C), m. The state is that after the block that was
-        taken last. Noise that is set in between counts from the next one.
+    def fit_blocks(self, slots: IntArray, dots: FloatArray, memory: MotionMemory | None = None) -> list[FittedRun]:
+        """Return the fits of B blocks in turn, without remembering their motion.
+
+        ``slots`` (n,): which samples the blocks have. ``dots`` (B, n, C), m. ``memory``: before them, None for ours.
         """
         full = len(slots) == self._size
         # Sums over more numbers than that take another order.
         most = max(AT_ONCE // dots[0].size, 1) if full else 1
-        at = 0
-        while at < len(dots):
-            terms = self._full
-            memories, run = self._together(slots, dots[at : at + most])
-            for i, memory in enumerate(memories):
-                self._memory = memory
-                at += 1
-                yield run, i
-                if self._full is not terms:
-                    break
+        terms = self._full if full else self._terms_without(slots)
+        runs: list[FittedRun] = []
+        memory = self.memory if memory is None else memory
+        for at in range(0, len(dots), most):
+            runs.append(self._together(terms, slots, dots[at : at + most], memory))
+            memory = runs[-1].memories[-1]
+        return runs
 
-    def _together(self, slots: IntArray, dots: FloatArray) -> tuple[Sequence[_Memory], FittedRun]:
-        """The memory after each block and its fit, as far as the present noise holds."""
+    def _together(self, terms: _Terms, slots: IntArray, dots: FloatArray, memory: MotionMemory) -> FittedRun:
+        """The fits of blocks of which none has a sum over more than ``AT_ONCE`` numbers."""
         xp, count = self._xp, self._count
         blocks, samples, _ = dots.shape
         # Samples first, then orders, blocks and combinations: sums are over what is first.
@@ -284,16 +284,14 @@ class BlockFit:
         # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
         offset = xp.sum(z, 0) / samples
         z = z - offset
-        full = samples == self._size
-        terms = self._full if full else self._terms_without(slots)
         orders, reported = self._orders, len(terms.v)
         observed = xp.einsum('sja,sza->jza', terms.all, z)
         c = observed[orders : orders + reported]
-        memories, motion = self._motion(c, terms)
+        memories, motion = self._motion(c, terms, memory)
         x, missed = _weights(terms, motion, self._middle, xp)
         value = xp.sum(x * observed[:orders], 0) + offset
         weights: FloatArray | None = None
-        if full:
+        if terms is self._full:
             covariance = xp.einsum('kza,kjab,jzb->zab', x, self._of_full, x)
         else:
             weights = np.zeros((blocks, count, self._size))
@@ -314,7 +312,7 @@ class BlockFit:
         if self._vibrations:
             vibrating = self._vibrate(covariance, x, weights)
         rows, covariance = self._combinations.back(value, covariance)
-        return memories, FittedRun(list(map(tuple, rows.tolist())), covariance, misfit, vibrating)
+        return FittedRun(list(map(tuple, rows.tolist())), covariance, misfit, vibrating, memories)
 
     def _vibrate(self, covariance: FloatArray, x: FloatArray, weights: FloatArray | None) -> list[tuple[int, ...]]:
         """Add what vibrates to the ``covariance`` (B, C, C) of blocks; for each the tones that matter there."""
@@ -327,14 +325,14 @@ class BlockFit:
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        return tuple(np.concatenate(self._memory).swapaxes(1, 2).ravel().tolist())
+        return tuple(np.concatenate(self.memory).swapaxes(1, 2).ravel().tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
         wanted = 4 * self._count * self._orders
         if len(values) != wanted:
             raise ValueError(f'a fit of {self._size} samples a block has {wanted} values, not {len(values)}')
-        self._memory = _Memory(*np.array(values).reshape(2, 2, self._count, self._orders).swapaxes(2, 3))
+        self.memory = MotionMemory(*np.array(values).reshape(2, 2, self._count, self._orders).swapaxes(2, 3))
 
     def _terms_without(self, slots: IntArray) -> _Terms:
         """Of the samples that are present: their precision is a block of a matrix's inverse, inverted."""
@@ -348,22 +346,22 @@ class BlockFit:
         own = p[:, slots[:, None], slots] - xp.einsum('asg,atg->ast', xp.einsum('asg,agh->ash', cross, inner), cross)
         return _terms(self._q[slots], own, self._middle, self._full.v, xp)
 
-    def _motion(self, c: FloatArray, terms: _Terms) -> tuple[Sequence[_Memory], FloatArray]:
-        """The memory after each block, and tau^2 (K, B, C) by it; of order 0 nothing is known beforehand.
+    def _motion(self, c: FloatArray, terms: _Terms, memory: MotionMemory) -> tuple[Sequence[MotionMemory], FloatArray]:
+        """Return the memory after each block, and tau^2 (K, B, C) by it; of order 0 nothing is known beforehand.
 
-        ``c`` (told, B, C): coefficients of the orders that the blocks tell of.
+        ``c`` (R, B, C): coefficients of the orders that the blocks determine. ``memory``: before them.
         """
         c = c.swapaxes(0, 1)
         if self._orders == 1:
-            return [self._memory] * len(c), c.swapaxes(0, 1)
+            return [memory] * len(c), c.swapaxes(0, 1)
         reported, usual_v = c.shape[1], self._full.v
         square = c * c
         excess = square - terms.v
-        recent = _recent_after(self._memory.recent, excess, terms.sure)
+        recent = _recent_after(memory.recent, excess, terms.sure)
         late = recent[:, 0] / np.maximum(recent[:, 1], 1e-12)
         # Of the noise and the motion of late.
         expected = usual_v[:reported] + np.maximum(late[1:, :reported], 0.0)
-        lasting = _lasting_after(self._memory.lasting, excess, terms.sure, late[1:, :reported], expected)
+        lasting = _lasting_after(memory.lasting, excess, terms.sure, late[1:, :reported], expected)
         usual = np.maximum(late - _BIAS * usual_v, 1e-9 * usual_v)
         np.maximum(usual, lasting[:, 0] - _LASTING_BIAS * usual_v, out=usual)
         before, tau = usual[:-1], usual[1:].copy()
@@ -375,7 +373,7 @@ class BlockFit:
         # for being large.
         still = self._combinations.still
         tau[:, :, still:] = before[:, :, still:]
-        return list(map(_Memory, recent[1:], lasting[1:])), tau.swapaxes(0, 1)
+        return list(map(MotionMemory, recent[1:], lasting[1:])), tau.swapaxes(0, 1)
 
     def _believe(self, c: FloatArray, terms: _Terms, tau: FloatArray) -> None:
         """Give ``tau`` (B, K, C) what a block alone says where its coefficients ``c`` contradict it together.
@@ -399,9 +397,9 @@ class BlockFit:
 
 
 def _recent_after(recent: FloatArray, excess: FloatArray, sure: FloatArray) -> FloatArray:
-    """:attr:`_Memory.recent` (B + 1, 2, K, C) before the first block and after each.
+    """:attr:`MotionMemory.recent` (B + 1, 2, K, C) before the first block and after each.
 
-    ``excess`` (B, told, C): c_k^2 less its noise; ``sure`` (told, C): how much a block says of it.
+    ``excess`` (B, R, C): c_k^2 less its noise; ``sure`` (R, C): how much a block says of it.
     """
     reported = len(sure)
     out = np.empty((len(excess) + 1, *recent.shape))
@@ -418,9 +416,9 @@ def _recent_after(recent: FloatArray, excess: FloatArray, sure: FloatArray) -> F
 def _lasting_after(
     lasting: FloatArray, excess: FloatArray, sure: FloatArray, late: FloatArray, expected: FloatArray
 ) -> FloatArray:
-    """:attr:`_Memory.lasting` (B + 1, 2, K, C) before the first block and after each; what is over begins anew.
+    """:attr:`MotionMemory.lasting` (B + 1, 2, K, C) before the first block and after each; what is over begins anew.
 
-    ``late`` (B, told, C): the mean of late; ``expected`` (B, told, C): with the noise.
+    ``late`` (B, R, C): the mean of late; ``expected`` (B, R, C): with the noise.
     """
     reported = len(sure)
     out = np.empty((len(excess) + 1, *lasting.shape))
@@ -436,24 +434,6 @@ def _lasting_after(
         if np.count_nonzero(over):
             mean[over] = short[over]
             blocks[over] = 1.0 / _FORGET
-    return out
-
-
-def inverse(matrices: FloatArray) -> FloatArray:
-    """Inverses of positive definite ``matrices`` (n, k, k), by elimination; no pivots are needed.
-
-    Element by element, so that the bits are those of any machine.
-    """
-    size = matrices.shape[1]
-    out = matrices.copy()
-    for i in range(size):
-        pivot = 1.0 / out[:, i, i]
-        row = out[:, i, :] * pivot[:, None]
-        column = out[:, :, i].copy()
-        out -= column[:, :, None] * row[:, None, :]
-        out[:, i, :] = row
-        out[:, :, i] = -column * pivot[:, None]
-        out[:, i, i] = pivot
     return out
 
 
@@ -475,9 +455,9 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, xp: Arithmet
     if found:
         x[used] = found
     if reported < len(motion):
-        # So few samples cannot tell of these.
-        untold = middle[reported:, None, None] - xp.einsum('akj,jza->kza', terms.information[:, reported:], x)
-        missed += xp.sum(untold * untold * motion[reported:], 0)
+        # So few samples do not determine these orders.
+        undetermined = middle[reported:, None, None] - xp.einsum('akj,jza->kza', terms.information[:, reported:], x)
+        missed += xp.sum(undetermined * undetermined * motion[reported:], 0)
     return x, missed
 
 

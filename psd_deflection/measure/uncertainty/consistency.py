@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
-from psd_deflection.measure.uncertainty.block_fit import inverse
+from psd_deflection.base.arithmetic.matrices import inverse
 from psd_deflection.records import FloatArray
 
 CONTRADICTS, DOUBTFUL = 5.7330e-7, 0.01

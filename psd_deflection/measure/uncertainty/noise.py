@@ -29,8 +29,9 @@ from math import pi
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic.matrices import inverse
 from psd_deflection.base.arithmetic.spectra import lagged_products
-from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
+from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis
 from psd_deflection.measure.uncertainty.combinations import Residual, combinations_of
 from psd_deflection.measure.uncertainty.vibration import Hum, Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit and check of a set of PSDs: all of a rig, or a subset while the others cannot be trusted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
-from psd_deflection.measure.uncertainty.block_fit import BlockFit, FittedRun
+from psd_deflection.measure.uncertainty.block_fit import BlockFit
 from psd_deflection.measure.uncertainty.consistency import (
     BaseLineExcess,
     ConsistencyCheck,
@@ -17,7 +17,7 @@ from psd_deflection.measure.uncertainty.consistency import (
 from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.vibration import Tone
 from psd_deflection.model.plate.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 
 _STEPS = 7
@@ -99,10 +99,6 @@ class PsdSet:
         """Use their part of the noise of all readings."""
         own = np.ix_(self.columns, self.columns)
         self.fit.set_noise(noise.gamma[own], [Tone(t.frequency, t.covariance[own]) for t in noise.tones])
-
-    def fits(self, slots: IntArray, samples: FloatArray) -> Iterator[tuple[FittedRun, int]]:
-        """Fit blocks in turn, as :meth:`BlockFit.fits`; ``samples`` (B, n, 2P), m, of all PSDs."""
-        return self.fit.fits(slots, samples if self.is_full else samples[:, :, self.columns])
 
     def unexplained(
         self, dots: tuple[float, ...], residual: tuple[float, ...], covariance: FloatArray, pose: Sequence[float]

@@ -111,7 +111,7 @@ def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
     moved.set_zeros(new)
     rng = np.random.default_rng(3)
     samples, residual = (new.zeros.ravel() + 1e-6 * rng.normal(size=(n, 2 * psds)) for n in (20, 1))
-    one, other = (next(of.fits(of.full, ALL, samples[None]))[0].block(0) for of in (moved, fresh))
+    one, other = (of.full.fit.fit(ALL, samples) for of in (moved, fresh))
     assert one[0] == other[0]
     np.testing.assert_array_equal(one[1], other[1])
     answers = [checked(of, np.array(one[0]), residual[0], one[1]) for of in (moved, fresh)]
@@ -134,8 +134,7 @@ def test_segments_change_the_noise_of_all_sets() -> None:
     assert [b for b, samples in enumerate(blocks) if of.learn(b, ALL, samples, VOLTS)] == [49, 99, 149]
     still = np.tile(rig.zeros.ravel(), (20, 1))
     for psds, count in ((of.full, 6), (subset, 4)):
-        run, _ = next(of.fits(psds, ALL, still[None]))
-        dots, covariance, _, _ = run.block(0)
+        dots, covariance, *_ = psds.fit.fit(ALL, still[:, psds.columns])
         assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
         assert len(dots) == count
     # Dots that fall on one another have no direction in which they could be apart.
@@ -149,8 +148,8 @@ def test_a_subset_has_the_noise_of_its_own_readings() -> None:
     rig, own = rig_of(3), np.array([1.0, 2.0, 4.0, 8.0]) * 1e-12
     subset = PsdSet(rig, (0, 2), 'none')
     subset.set_noise(StreamNoise(20, rig.centers, rig.centers + rig.zeros, np.insert(own, 2, (1e-10, 1e-10)), 0.0))
-    run, _ = next(subset.fits(ALL, np.tile(rig.zeros.ravel(), (1, 20, 1))))
-    np.testing.assert_allclose(np.diag(run.covariance[0]), own / 20.0, rtol=0.1)
+    fitted = subset.fit.fit(ALL, np.tile(rig.zeros.ravel(), (20, 1))[:, subset.columns])
+    np.testing.assert_allclose(np.diag(fitted.covariance), own / 20.0, rtol=0.1)
 
 
 def test_the_base_line_is_between_the_places_of_the_dots() -> None:
