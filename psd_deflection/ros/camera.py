@@ -51,7 +51,7 @@ class CameraNode(BaseNode[CameraSettings]):
 
     def declare(self) -> DeclaredParameters[CameraSettings]:
         """Those of a camera."""
-        return self.declared(SETTINGS, self._given, self._changed)
+        return self.declare_section(SETTINGS, self._given, self._changed)
 
     def set_up(self) -> None:
         """Listen to images."""

@@ -123,7 +123,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._names = list(arm.names)
         if self._given.joints == (ALL_JOINTS,):
             self._given = dataclasses.replace(self._given, joints=arm.names)
-        return self.declared(SETTINGS, self._given, self._changed)
+        return self.declare_section(SETTINGS, self._given, self._changed)
 
     def _read(self, given: CompensatorSettings) -> Arm:
         if given.urdf:
@@ -356,8 +356,8 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         """Hold while the robot does not run, or while another node publishes what we publish."""
         now = time.monotonic()
         self.gate.subscribe_to_kept()
-        other_publishers = self.other_publishers() if self._drive else []
-        other = f'another node publishes {other_publishers[0]}' if other_publishers else ''
+        contested = self.contested_topics() if self._drive else []
+        other = f'another node publishes {contested[0]}' if contested else ''
         if self._drive and now - self._begun < LOOK_S:
             other = other or 'it looks whether another node commands the robot'
         with self._lock:

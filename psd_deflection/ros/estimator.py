@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``estimator``, a lifecycle node (REP-2002): *configured* it reads, estimates and records; *active* it
+"""The node ``estimator``, a lifecycle node: *configured* it reads, estimates and records; *active* it
 publishes too, from the pipeline's own thread. The executor serves parameters, services, inputs and the 1 Hz
 diagnostics."""
 
@@ -232,7 +232,7 @@ class EstimatorNode(BaseNode[Rig]):
         self._sink = PublisherSink(self.node, topics_of(self.settings))
         self._inputs = InputRecorder(self.node, subscribed(self.settings))
 
-    def watched(self) -> Iterable[str]:
+    def exclusive_topics(self) -> Iterable[str]:
         """The estimate: whoever publishes that publishes all the rest."""
         return self._sink.names((DEFLECTION,))
 
@@ -344,11 +344,11 @@ class EstimatorNode(BaseNode[Rig]):
                 self._rig_reported.notify(again=False)
             # In the time of the samples, so that a recording has one time even if the system clock
             # is set.
-            self.session.fanout.put(self.named(self._health.report(self.session.acquisition.now_ns())))
+            self.session.fanout.put(self.with_node_name(self._health.report(self.session.acquisition.now_ns())))
             return
         now = time.time_ns()
         entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())
-        (message,) = to_messages(self.named(DiagnosticReport(now, (entry,))))
+        (message,) = to_messages(self.with_node_name(DiagnosticReport(now, (entry,))))
         self._sink.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
 
 

@@ -47,7 +47,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
 
     def declare(self) -> DeclaredParameters[ShaperSettings]:
         """Those of a shaper."""
-        return self.declared(SHAPING, self._asked, self._changed)
+        return self.declare_section(SHAPING, self._asked, self._changed)
 
     def set_up(self) -> None:
         """Listen to trajectories and joints."""
@@ -99,9 +99,9 @@ class ShaperNode(BaseNode[ShaperSettings]):
 
     def _shape(self, message: Any) -> Any:
         """The message of a trajectory, shaped. Raises ConfigError for one that cannot be followed."""
-        if other_publishers := self.other_publishers():
+        if contested := self.contested_topics():
             # Both would answer, and the arm would get each motion twice.
-            raise ConfigError(f'another node publishes {other_publishers[0]}')
+            raise ConfigError(f'another node publishes {contested[0]}')
         if self._undescribed:
             raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
         trajectory = _trajectory(message)
@@ -137,9 +137,9 @@ class ShaperNode(BaseNode[ShaperSettings]):
             self._follow.close()
         super().leave()
 
-    def watched(self) -> Iterable[str]:
+    def exclusive_topics(self) -> Iterable[str]:
         """What it publishes, and the feedback of its action."""
-        yield from super().watched()
+        yield from super().exclusive_topics()
         if self._follow is not None:
             yield self._follow.topic()
 
@@ -150,8 +150,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
     def _state(self) -> tuple[int, str]:
         if not self.active:
             return STALE, 'not active'
-        if other_publishers := self.other_publishers():
-            return WARN, f'it shapes nothing: another node publishes {other_publishers[0]}'
+        if contested := self.contested_topics():
+            return WARN, f'it shapes nothing: another node publishes {contested[0]}'
         if self._why:
             return WARN, f'the last trajectory was rejected: {self._why}'
         if self._undescribed:
