@@ -1,14 +1,15 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Reads bags (folders) and single MCAP files: our own and those of ``ros2 bag record`` and other programs.
+"""Reads bag folders and single MCAP files, written by this package, by ``ros2 bag record`` or by another program.
 
-Sample numbers are recorded modulo 2^32. They are extended again, so that the blocks are those of the writer (2^32 is
-not a multiple of 20).
+A block is the samples with equal ``seq // block_size``. The recorded ``seq`` is modulo 2^32, which is not a multiple of
+the default block size, 20. So the reader restores the full numbers; its blocks are then those of the recorded node.
 """
 
 import contextlib
 import functools
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
@@ -45,7 +46,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.mcap_format import Warnings
 from psd_deflection.recordings.read.clouds import CloudDecoder, joined_points
-from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage
+from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage, RecordedChannel
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.write.bag_writer import META_DROPPED, META_NODE, META_SOFTWARE
 from psd_deflection.records import (
@@ -56,65 +57,66 @@ from psd_deflection.records import (
     RawChunk,
     ReferencePose,
     ReferenceWithCovariance,
-    RigState,
     SampleBlock,
     TemperatureReading,
 )
 
 MAX_YAML_BYTES = 16_000_000
+"""Largest ``metadata.yaml`` that is read, bytes: the file is untrusted input."""
 
-MOST_MEMORIES = 4
-"""So many of the states that a pipeline tells are kept: the one from before the first block, and those after it."""
+MAX_PIPELINE_STATES = 4
+"""Recorded pipeline states (what the processing carries from one block to the next) that are kept. A replay needs only
+the first state at or after its first block."""
 
 MAX_RESTARTS = 10_000
-"""Restarts of one recording that are counted."""
+"""Device restarts that are kept: a bound on memory."""
 
-LEAP_NS = 10_000_000_000
-"""A recorder that does not keep up is late by less."""
+CLOCK_LEAP_NS = 10_000_000_000
+"""Largest change of (log time - stamp) that a slow recorder explains, ns. A larger change is a leap of its clock."""
 
-_BATCH = 50
-"""Number of messages whose samples are decoded at once: numpy's cost is per call."""
+_BATCH_MESSAGES = 50
+"""Messages whose points are converted together, because numpy's overhead is per call."""
 
-T = TypeVar('T')
+Converted = TypeVar('Converted')
 
 
 class BagRecording(Recording):
-    """A bag folder or a single ``.mcap``. Raises RecordingError if nothing in it can be read.
+    """A bag folder or a single ``.mcap`` file. Raises RecordingError if ``path`` is neither or cannot be read.
 
-    ``namespace``: of the node that was recorded (``/arm``). None: it is found, and every call that reads messages
-    raises RecordingError if the bag holds several rigs. Topics have their own names here, without the namespace.
+    ``block_size``: samples per block; None takes the recorded size. ``namespace``: ROS namespace of the recorded node
+    (``/arm``). None finds the namespace by the topic of the samples and raises RecordingError if several rigs were
+    recorded. Methods name topics without the namespace. :class:`Recording` describes the attributes.
     """
 
     def __init__(self, path: Path, block_size: int | None = None, namespace: str | None = None) -> None:
         super().__init__(path, block_size)
-        self._own_warnings = Warnings()
-        self._leapt = False
+        self._bag_warnings = Warnings()
+        self._clock_leap_reported = False
         files = self._files_of(path) if path.is_dir() else [path]
-        self._sources = [McapReader(f) for f in files]
-        bare = None if namespace is None else namespace.strip('/')
-        self._given_namespace = f'/{bare}' if bare else bare
-        metadata: dict[str, dict[str, str]] = {}
-        for source in self._sources:
-            metadata.update(source.metadata)
+        self._sources = [McapReader(file) for file in files]
+        stripped = None if namespace is None else namespace.strip('/')
+        # None: not given; '': the root namespace.
+        self._given_namespace = f'/{stripped}' if stripped else stripped
+        metadata = {name: entry for source in self._sources for name, entry in source.metadata.items()}
         software = metadata.get(META_SOFTWARE, {})
         self.own = META_SOFTWARE in metadata
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
-        self.dropped_here = _dropped(metadata.get(META_DROPPED, {}))
-        self._take_rig()
+        self.dropped_here = _dropped_counts(metadata.get(META_DROPPED, {}))
+        self._read_rig()
         self.restarts = self._recorded_restarts()
 
     def _files_of(self, folder: Path) -> list[Path]:
-        """The bag's files in the order of ``metadata.yaml``, else of their numbers."""
+        """Return the bag's MCAP files in the order of ``metadata.yaml``; without it, by the numbers in their names."""
         meta_file = folder / 'metadata.yaml'
-        found = files_in(folder)
+        present_files = files_in(folder)
         if not meta_file.is_file():
-            if not found:
+            if not present_files:
                 raise RecordingError(f'{folder}: is no bag: it holds neither metadata.yaml nor an .mcap file')
-            self._own_warnings.add(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
-            return found
+            self._bag_warnings.add(f'{folder}: has no metadata.yaml (a recorder that was stopped hard?)')
+            return present_files
         information = read_information(meta_file)
         storage = information.get('storage_identifier')
-        # `ros2 bag reindex` leaves it empty; the file says itself what it is.
+        # `ros2 bag reindex` leaves the identifier empty. McapReader checks the format of each file itself.
         if storage not in ('mcap', '', None):
             raise RecordingError(
                 f'{folder}: is a bag with {storage} storage; only mcap is read: `mcap convert IN.db3 OUT.mcap` or '
@@ -125,345 +127,343 @@ class BagRecording(Recording):
                 f'{folder}: is compressed by rosbag2 (compression_mode {information["compression_mode"]}); '
                 'record with --storage-preset-profile zstd_fast instead, or unpack it with ros2 bag convert'
             )
-        named = information.get('relative_file_paths')
-        if not isinstance(named, list) or not named or not all(isinstance(n, str) for n in named):
+        listed = information.get('relative_file_paths')
+        if not isinstance(listed, list) or not listed or not all(isinstance(path, str) for path in listed):
             raise RecordingError(f'{meta_file}: relative_file_paths names no file')
-        # Bags before version 4 have the folder's name before the file's.
-        files = [folder / PurePath(n).name for n in named]
-        for file in files:
+        # Before version 4 of metadata.yaml the listed paths begin with the name of the bag's folder.
+        listed_files = [folder / PurePath(path).name for path in listed]
+        for file in listed_files:
             if not file.is_file():
                 raise RecordingError(
                     f'{file}: is named by metadata.yaml and is not there; `psd-deflection recover` makes that one anew'
                 )
-        for file in found:
-            if file not in files:
-                self._own_warnings.add(
+        for file in present_files:
+            if file not in listed_files:
+                self._bag_warnings.add(
                     f'{file}: is not listed in metadata.yaml and is not read; `psd-deflection recover` lists all files'
                 )
-        return files
+        return listed_files
 
     @property
     def complete(self) -> bool:
-        """True if every file has its end and everything read so far was undamaged."""
-        return not any(s.warnings for s in self._sources)
+        """True if no file is cut, and no damage was found in what has been read so far."""
+        return not any(source.warnings for source in self._sources)
 
     @property
     def warnings(self) -> Sequence[str]:
-        """One line for each cut or damage, and for samples that were left out."""
-        return [*self._own_warnings.lines(), *self._found.lines(), *(w for s in self._sources for w in s.warnings)]
+        """Faults that did not stop the reading, one a line: of the bag, then added by ``warn``, then of each file."""
+        file_warnings = (line for source in self._sources for line in source.warnings)
+        return [*self._bag_warnings.lines(), *self._found.lines(), *file_warnings]
 
-    def _warn(self, text: str) -> None:
-        self._own_warnings.add(f'{self.path}: {text}')
+    def _add_warning(self, text: str) -> None:
+        self._bag_warnings.add(f'{self.path}: {text}')
 
-    def _note_restart(self, last: int, first: int) -> None:
+    def _add_restart(self, before: int, after: int) -> None:
+        """Keep a device restart: the last sample number before the restart and the first sample number after it."""
         if len(self.restarts) < MAX_RESTARTS:
-            self.restarts.add((last, first))
+            self.restarts.add((before, after))
 
-    def _take_rig(self) -> None:
-        """Parameters, hello and changes as the topic of the rig has them."""
+    def _read_rig(self) -> None:
+        """Read parameters, versions, ``hello`` (device description), changes and pipeline states from topic ``RIG``."""
+        # The keys are an ordered set: a node may send the same change again.
         changes: dict[ParameterChange, None] = {}
-        present: dict[str, object] = {}
+        # Parameters of the first rig, with all changes so far.
+        first_rig: dict[str, object] = {}
         for channel, log_time, message in self.messages([RIG]):
             if channel.type != TOPIC_TYPES[RIG] or channel.encoding != 'cdr':
                 continue
             try:
-                state = string.to_rig(cdr.decode(channel.type, message))
-                change = _to_change(state.t_ns, state.block, state.changed)
-                memory = _memory_in(state)
+                rig_state = string.to_rig(cdr.decode(channel.type, message))
+                t_ns, block, memory = rig_state.t_ns, rig_state.block, rig_state.memory
+                change = _to_change(t_ns, block, rig_state.changed)
+                # FULL marks a change that replaces the complete state of a pipeline.
+                pipeline_state = None if memory is None else _to_change(t_ns, block, {FULL: 1.0, **memory})
             except (ValueError, TypeError) as error:
-                self._warn(f'{RIG} at log time {log_time} ns is not readable ({error}) and is left out')
+                self._add_warning(f'{RIG} at log time {log_time} ns is not readable ({error}) and is left out')
                 continue
             if not self.parameters:
-                self.parameters, self.version = state.parameters, state.version
-                self.made_with = state.made_with
-                present = dict(state.parameters)
+                self.parameters, self.version = rig_state.parameters, rig_state.version
+                self.made_with = rig_state.made_with
+                first_rig = dict(rig_state.parameters)
             if self.hello is None:
-                self.hello = state.hello
-            present |= {name: value for name, value in state.changed.items() if name in present}
-            if present != state.parameters and change not in changes:
-                self._warn(f'another rig starts at log time {log_time} ns; the first one is taken for all')
+                self.hello = rig_state.hello
+            first_rig |= {name: value for name, value in rig_state.changed.items() if name in first_rig}
+            if first_rig != rig_state.parameters and change not in changes:
+                self._add_warning(f'another rig starts at log time {log_time} ns; the first one is taken for all')
             if change.values:
                 changes[change] = None
-            if memory is not None and len(self.memories) < MOST_MEMORIES:
-                self.memories = [*self.memories, memory]
+            if pipeline_state is not None and len(self.memories) < MAX_PIPELINE_STATES:
+                self.memories = [*self.memories, pipeline_state]
         self.changes = sorted(changes, key=lambda change: change.block)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Encoded messages of the files: (channel, log_time, cdr), of ``topics`` or of all."""
-        namespace = self.namespace
-        if not namespace:
+        """Yield the encoded messages on ``topics`` (None: on all), file by file, in the order of each file."""
+        if not self.namespace:
             for source in self._sources:
                 yield from source.messages(topics)
             return
-        names = self._names
-        wanted = {name for name, ours in names.items() if topics is None or ours in topics}
+        without_namespace = self._without_namespace
+        recorded_topics = {name for name, topic in without_namespace.items() if topics is None or topic in topics}
         for source in self._sources:
-            for channel, log_time, message in source.messages(wanted):
-                yield RawMessage(channel._replace(topic=names[channel.topic]), log_time, message)
+            for channel, log_time, message in source.messages(recorded_topics):
+                yield RawMessage(channel._replace(topic=without_namespace[channel.topic]), log_time, message)
 
     @functools.cached_property
     def namespace(self) -> str:
-        """Namespace of the recorded node, '' if it has none. Raises RecordingError if there are several."""
+        """Namespace of the recorded node, '' if it has none. Raises RecordingError if the bag holds several rigs."""
         if self._given_namespace is not None:
             return self._given_namespace
-        known = self._recorded_topics()
-        if not any(topic.endswith(SAMPLES) for topic in known):
-            # A cut file names its topics where its chunks begin.
-            if self._first_of(SAMPLES) is not None:
+        topics = self._known_topics()
+        if not any(topic.endswith(SAMPLES) for topic in topics):
+            # A cut file lacks the list of topics at its end: topics become known as its chunks are read.
+            if self._first_message_on(SAMPLES) is not None:
                 return ''
-            known = self._recorded_topics()
-        if SAMPLES in known:
+            topics = self._known_topics()
+        if SAMPLES in topics:
             return ''
-        found = [topic for topic in sorted(known) if topic.endswith(SAMPLES) and self._has_samples(topic)]
-        if len(found) > 1:
-            choices = ', '.join(topic.removesuffix(SAMPLES) for topic in found)
+        sample_topics = [topic for topic in sorted(topics) if topic.endswith(SAMPLES) and self._has_samples_on(topic)]
+        if len(sample_topics) > 1:
+            choices = ', '.join(topic.removesuffix(SAMPLES) for topic in sample_topics)
             raise RecordingError(
-                f'{self.path}: holds the samples of {len(found)} rigs; give the namespace of one: {choices}'
+                f'{self.path}: holds the samples of {len(sample_topics)} rigs; give the namespace of one: {choices}'
             )
-        return found[0].removesuffix(SAMPLES) if found else ''
+        return sample_topics[0].removesuffix(SAMPLES) if sample_topics else ''
 
-    def _recorded_topics(self) -> set[str]:
-        return {c.topic for s in self._sources for c in s.channels}
+    def _known_topics(self) -> set[str]:
+        """Return the topics known so far, with namespace: all topics once each file is complete or read to its end."""
+        return {channel.topic for source in self._sources for channel in source.channels}
 
-    def _first_of(self, topic: str) -> RawMessage | None:
-        return next((m for s in self._sources for m in s.messages([topic])), None)
+    def _first_message_on(self, recorded_topic: str) -> RawMessage | None:
+        """Return the first message on ``recorded_topic``, which includes the namespace; None without such a message."""
+        return next((message for source in self._sources for message in source.messages([recorded_topic])), None)
 
-    def _has_samples(self, topic: str) -> bool:
-        """Whether the messages of ``topic`` are ours, by the fields of the first one."""
-        first = self._first_of(topic)
+    def _has_samples_on(self, recorded_topic: str) -> bool:
+        """Whether the first message on ``recorded_topic`` is a point cloud with the fields of our samples."""
+        first = self._first_message_on(recorded_topic)
         if first is None or first.channel.type != TOPIC_TYPES[SAMPLES] or first.channel.encoding != 'cdr':
             return False
-        try:
+        with contextlib.suppress(ValueError):
             CloudDecoder().decode(first.cdr)
-        except ValueError:
-            return False
-        return True
+            return True
+        return False
 
     @functools.cached_property
-    def _names(self) -> dict[str, str]:
-        """Recorded name -> our name. What the namespace lacks is taken from outside, unless another rig is there."""
+    def _without_namespace(self) -> dict[str, str]:
+        """Topic without namespace by recorded topic; includes topics outside the namespace if the bag has one rig."""
         if not self.complete:
-            self._first_of('')
-        recorded = self._recorded_topics()
-        inside = {t: t.removeprefix(self.namespace) for t in recorded if t.startswith(f'{self.namespace}/')}
-        rigs = [t for t in recorded if t.endswith(SAMPLES)]
-        if len(rigs) > 1:
+            # Only a full pass shows all topics of a damaged file. No file has the topic '', so this search is one.
+            self._first_message_on('')
+        recorded_topics = self._known_topics()
+        prefix = f'{self.namespace}/'
+        inside = {topic: topic.removeprefix(self.namespace) for topic in recorded_topics if topic.startswith(prefix)}
+        if sum(topic.endswith(SAMPLES) for topic in recorded_topics) > 1:
+            # The topic of the diagnostics never has a namespace.
             return {DIAGNOSTICS: DIAGNOSTICS, **inside}
-        return {t: t for t in recorded if t not in inside.values()} | inside
+        # If two topics would get the same name, the topic inside the namespace gets it.
+        return {topic: topic for topic in recorded_topics if topic not in inside.values()} | inside
 
     def topics(self) -> dict[str, int]:
-        """Number of messages of each topic."""
-        counts: dict[str, int] = {}
-        for channel, _, _ in self.messages():
-            counts[channel.topic] = counts.get(channel.topic, 0) + 1
-        return counts
+        """Return the number of messages of each topic."""
+        return dict(Counter(message.channel.topic for message in self.messages()))
 
     @property
     def has_samples(self) -> bool:
-        """Whether there is a message of samples."""
+        """Whether the recording has a message with samples."""
         return next(self.messages([SAMPLES]), None) is not None
 
     def blocks(self) -> Iterator[SampleBlock]:
-        """The samples, cut into blocks at seq // block_size. Raises RecordingError if there are none."""
+        """Yield the samples in blocks of equal ``seq // block_size``. Raises RecordingError if there are none."""
         blocks = super().blocks()
-        first = next(blocks, None)
-        if first is None:
-            cut = '' if self.complete else ' before the cut'
-            cut += f' in the namespace {self.namespace}' if self.namespace else ''
+        first_block = next(blocks, None)
+        if first_block is None:
+            searched = '' if self.complete else ' before the cut'
+            searched += f' in the namespace {self.namespace}' if self.namespace else ''
             raise RecordingError(
-                f'{self.path}: holds no samples{cut} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
+                f'{self.path}: holds no samples{searched} (topic {SAMPLES}); `psd-deflection info` lists what it holds'
             )
-        yield first
+        yield first_block
         yield from blocks
 
     def _chunks(self) -> Iterator[RawChunk]:
-        count = RecordedSequence(self.block_size, self._warn, self._note_restart)
+        """Yield the samples in volts with full sample numbers, one batch of messages or one message at a time."""
+        numbering = RecordedSequence(self.block_size, self._add_warning, self._add_restart)
         psds = 0
-        for log_time, messages in self._clouds():
-            together = joined_points(messages)
-            parts = (
-                [together]
-                if count.follows(together.seq, together.t_ns, together.full)
-                else [joined_points([m]) for m in messages]
-            )
+        for log_time, messages in self._message_batches():
+            batch = joined_points(messages)
+            where = f'{self.path}: {SAMPLES} at log time {log_time} ns'
+            # Where a sample number or a time goes back (wrap, restart), messages are numbered one by one.
+            is_continuous = numbering.follows(batch.seq, batch.t_ns, batch.full)
+            parts = [batch] if is_continuous else [joined_points([message]) for message in messages]
             for part in parts:
                 try:
-                    seq = count.extended(part.seq, part.t_ns, part.full)
+                    seq = numbering.extended(part.seq, part.t_ns, part.full)
                 except ValueError as error:
-                    raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
-                _, _, t_ns, volts, flags = part
-                psds = psds or volts.shape[1] // 3
-                if volts.shape[1] != 3 * psds:
-                    raise RecordingError(
-                        f'{self.path}: {SAMPLES} at log time {log_time} ns: has {volts.shape[1] // 3} PSDs, '
-                        f'the samples before have {psds}'
-                    )
-                finite = np.isfinite(volts).all(axis=1)
+                    raise RecordingError(f'{where}: {error}') from None
+                # Each PSD has three channels: x, y and sum.
+                part_psds = part.volts.shape[1] // 3
+                psds = psds or part_psds
+                if part_psds != psds:
+                    raise RecordingError(f'{where}: has {part_psds} PSDs, the samples before have {psds}')
+                finite = np.isfinite(part.volts).all(axis=1)
                 if finite.all():
-                    yield RawChunk(seq, t_ns, volts, flags)
+                    yield RawChunk(seq, part.t_ns, part.volts, part.flags)
                     continue
-                self._warn('samples that are not numbers (NaN or infinite) are left out as lost')
-                yield RawChunk(seq[finite], t_ns[finite], volts[finite], flags[finite])
+                self._add_warning('samples that are not numbers (NaN or infinite) are left out as lost')
+                yield RawChunk(seq[finite], part.t_ns[finite], part.volts[finite], part.flags[finite])
 
-    def _clouds(self) -> Iterator[tuple[int, list[tuple[int, npt.NDArray[np.void]]]]]:
-        """Yields (log time, messages as (stamp, points)); all messages of one yield have the same layout."""
+    def _message_batches(self) -> Iterator[tuple[int, list[tuple[int, npt.NDArray[np.void]]]]]:
+        """Yield batches of messages with the same point layout: (first log time, [(stamp, points)]), times in ns."""
         decoder = CloudDecoder()
         batch: list[tuple[int, npt.NDArray[np.void]]] = []
-        first_time = 0
-        late: int | None = None
+        first_log_time = 0
+        last_delay_ns: int | None = None
         for channel, log_time, message in self.messages([SAMPLES]):
-            self._check_type(channel.type, channel.encoding, SAMPLES)
+            self._check_type(channel, TOPIC_TYPES[SAMPLES])
             try:
                 stamp, points = decoder.decode(message)
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
-            if late is not None and abs(log_time - stamp - late) > LEAP_NS and not self._leapt:
-                self._leapt = True
-                leap = (log_time - stamp - late) / 1e9
-                self._warn(
-                    f"the recorder's clock leapt by {leap:+.3f} s at log time {log_time} ns; samples keep their own "
-                    'times, marks and inputs without a stamp do not'
+            delay_ns = log_time - stamp
+            leap_ns = 0 if last_delay_ns is None else delay_ns - last_delay_ns
+            last_delay_ns = delay_ns
+            if abs(leap_ns) > CLOCK_LEAP_NS and not self._clock_leap_reported:
+                self._clock_leap_reported = True
+                self._add_warning(
+                    f"the recorder's clock leapt by {leap_ns / 1e9:+.3f} s at log time {log_time} ns; "
+                    'samples keep their own times, marks and inputs without a stamp do not'
                 )
-            late = log_time - stamp
-            if batch and (len(batch) == _BATCH or points.dtype != batch[0][1].dtype):
-                yield first_time, batch
+            if batch and (len(batch) == _BATCH_MESSAGES or points.dtype != batch[0][1].dtype):
+                yield first_log_time, batch
                 batch = []
             if len(points):
-                first_time = first_time if batch else log_time
+                if not batch:
+                    first_log_time = log_time
                 batch.append((stamp, points))
         if batch:
-            yield first_time, batch
+            yield first_log_time, batch
 
-    def _check_type(self, found: str, encoding: str, topic: str, wanted: str = '') -> None:
-        wanted = wanted or TOPIC_TYPES[topic]
-        if found != wanted or encoding != 'cdr':
-            raise RecordingError(f'{self.path}: {topic} is {found!r} in {encoding!r}, not {wanted} in cdr')
+    def _check_type(self, channel: RecordedChannel, expected_type: str) -> None:
+        """Raise RecordingError unless the messages of ``channel`` have the type ``expected_type``, encoded as CDR."""
+        topic, found_type, encoding = channel
+        if found_type != expected_type or encoding != 'cdr':
+            raise RecordingError(f'{self.path}: {topic} is {found_type!r} in {encoding!r}, not {expected_type} in cdr')
 
-    def _decoded(self, topic: str, convert: Callable[[dict[str, Any]], T]) -> list[T]:
-        """Every message of ``topic``; a message without a stamp (0) gets its time of arrival."""
-        out = []
+    def _records_on(self, topic: str, convert: Callable[[dict[str, Any]], Converted]) -> list[Converted]:
+        """Return the converted messages on ``topic``; a stamp of 0 (not set) is replaced by the log time."""
+        records = []
         for channel, log_time, message in self.messages([topic]):
-            self._check_type(channel.type, channel.encoding, topic)
+            self._check_type(channel, TOPIC_TYPES[topic])
             try:
                 fields = cdr.decode(channel.type, message)
                 if stamp_ns(fields) == 0:
                     fields['header'] = header(log_time, fields['header']['frame_id'])
-                out.append(convert(fields))
+                records.append(convert(fields))
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
-        return out
+        return records
 
     def loads(self) -> list[AppliedLoad]:
-        """Known loads, each held until the next."""
-        return self._decoded(LOAD, wrench_stamped.to_applied_load)
+        """Return the known loads at the tip; each acts until the next."""
+        return self._records_on(LOAD, wrench_stamped.to_applied_load)
 
     def marks(self) -> list[Mark]:
-        """The moments that somebody marked, each at its arrival. A live run rejects what is left out here, too."""
-        out = []
+        """Return the marks, sorted by their arrival (log time); invalid marks are left out, as in a live run."""
+        marks = []
         for channel, log_time, message in self.messages([MARK]):
-            self._check_type(channel.type, channel.encoding, MARK)
+            self._check_type(channel, TOPIC_TYPES[MARK])
             try:
                 mark = string.to_mark(cdr.decode(channel.type, message))
             except ValueError as error:
-                self._warn(f'{MARK} at log time {log_time} ns is left out: {error}')
+                self._add_warning(f'{MARK} at log time {log_time} ns is left out: {error}')
             else:
-                out.append(mark._replace(t_ns=log_time))
-        return sorted(out, key=lambda mark: mark.t_ns)
+                marks.append(mark._replace(t_ns=log_time))
+        return sorted(marks, key=lambda mark: mark.t_ns)
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
-        """Known accelerations of the base, with the time of arrival. A live run rejects what is left out here, too."""
+        """Yield (log time in ns, known acceleration of the base); invalid messages are left out, as in a live run."""
         for channel, log_time, message in self.messages([ACCELERATION]):
-            self._check_type(channel.type, channel.encoding, ACCELERATION)
+            self._check_type(channel, TOPIC_TYPES[ACCELERATION])
             with contextlib.suppress(ValueError):
                 yield log_time, accel_stamped.to_base(cdr.decode(channel.type, message))
 
     def references(self) -> list[ReferencePose]:
-        """Independent measurements of the tip."""
-        return self._decoded(REFERENCE, pose_stamped.to_reference)
+        """Return the independent measurements of the tip's pose."""
+        return self._records_on(REFERENCE, pose_stamped.to_reference)
 
     def references_with_covariance(self) -> list[ReferenceWithCovariance]:
-        """The same with their covariances, if they were recorded."""
-        return self._decoded(REFERENCE_WITH_COVARIANCE, pose_with_covariance_stamped.to_reference)
+        """Return the independent measurements that were recorded with a covariance."""
+        return self._records_on(REFERENCE_WITH_COVARIANCE, pose_with_covariance_stamped.to_reference)
 
     def temperatures(self) -> list[TemperatureReading]:
-        """Ambient temperatures."""
-        return self._decoded(TEMPERATURE, temperature.to_reading)
+        """Return the ambient temperatures."""
+        return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Recorded deflections by topic: the primary one, with covariance, and each solver's."""
-        rows: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
+        """Return the unfiltered estimates by topic: primary, primary with covariance, and each solver's."""
+        rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic
             if topic == DEFLECTION_WITH_COVARIANCE:
-                wanted = pose_with_covariance_stamped.MESSAGE.name
+                expected_type = pose_with_covariance_stamped.MESSAGE.name
             elif topic != FILTERED and topic.startswith('/link_tip/') and topic.endswith('/deflection'):
-                wanted = pose_stamped.MESSAGE.name
+                expected_type = pose_stamped.MESSAGE.name
             else:
                 continue
-            self._check_type(channel.type, channel.encoding, topic, wanted)
+            self._check_type(channel, expected_type)
             try:
-                rows.setdefault(topic, []).append(cdr.numbers(wanted, message))
+                rows_by_topic.setdefault(topic, []).append(cdr.numbers(expected_type, message))
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
         marks = tuple(self.marks())
-        return {topic: _series(topic, found, marks) for topic, found in rows.items()}
+        return {topic: _estimate_series(topic, rows, marks) for topic, rows in rows_by_topic.items()}
 
 
-def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterChange:
-    def number(value: object) -> float:
-        # Unchanged: an integer must be read back as an integer.
-        if isinstance(value, int | float):
-            return value
-        raise TypeError
-
+def _to_change(t_ns: int, block: int, json_values: Mapping[str, Any]) -> ParameterChange:
+    """Return the change to ``json_values``. Raises TypeError for a value that is no number, text or list of numbers."""
     values: list[tuple[str, float | str | tuple[float, ...]]] = []
-    for key, value in tree.items():
-        if isinstance(value, list):
-            values.append((key, tuple(map(number, value))))
-        else:
-            values.append((key, value if isinstance(value, str) else number(value)))
+    for name, value in json_values.items():
+        numbers = value if isinstance(value, list) else [value]
+        if not isinstance(value, str) and not all(isinstance(number, int | float) for number in numbers):
+            raise TypeError
+        values.append((name, tuple(value) if isinstance(value, list) else value))
     return ParameterChange(t_ns, block, tuple(values))
 
 
-def _memory_in(state: RigState) -> ParameterChange | None:
-    """All that the pipeline remembers, as a change from which another one goes on; None if it is not told."""
-    if state.memory is None:
-        return None
-    return _to_change(state.t_ns, state.block, {FULL: 1.0, **state.memory})
-
-
-def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]], marks: tuple[Mark, ...]) -> EstimateSeries:
-    t_ns = np.array([t for t, _ in rows], dtype=np.int64)
-    numbers = np.array([v for _, v in rows], dtype=np.float64)
+def _estimate_series(topic: str, rows: list[tuple[int, tuple[float, ...]]], marks: tuple[Mark, ...]) -> EstimateSeries:
+    """Return the estimates on ``topic``; ``rows``: (stamp in ns, all float64 of the message) for each message."""
+    t_ns = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+    numbers = np.array([values for _, values in rows], dtype=np.float64)
     pose, tilt = pose_stamped.to_poses(numbers)
     covariance = pose_with_covariance_stamped.to_covariances(numbers) if topic == DEFLECTION_WITH_COVARIANCE else None
     return EstimateSeries(topic, t_ns, pose, tilt, covariance, marks=marks)
 
 
 def files_in(folder: Path) -> list[Path]:
-    """The ``.mcap`` files of a folder in the order of their numbers."""
+    """Return the ``.mcap`` files in ``folder``: first those without a number, then by number (``run_10.mcap``: 10)."""
 
-    def number(path: Path) -> tuple[int, str]:
-        found = re.search(r'_([0-9]{1,9})$', path.stem)
-        return (int(found[1]) if found else -1, path.name)
+    def sort_key(path: Path) -> tuple[int, str]:
+        match = re.search(r'_([0-9]{1,9})$', path.stem)
+        return (int(match[1]) if match else -1, path.name)
 
-    return sorted((f for f in folder.glob('*.mcap') if f.is_file()), key=number)
+    return sorted((file for file in folder.glob('*.mcap') if file.is_file()), key=sort_key)
 
 
 def read_information(path: Path) -> dict[str, Any]:
-    """The content of ``metadata.yaml``. Raises RecordingError if it cannot be used."""
-    way_out = '`psd-deflection recover` makes it anew'
+    """Return ``rosbag2_bagfile_information`` of a ``metadata.yaml``. Raises RecordingError for an unusable file."""
+    remedy = '`psd-deflection recover` makes it anew'
     try:
         tree = tree_of_file(path, "bag's metadata", MAX_YAML_BYTES)
     except ConfigError as error:
-        raise RecordingError(f'{error}; {way_out}') from None
+        raise RecordingError(f'{error}; {remedy}') from None
     information = tree.get('rosbag2_bagfile_information') if isinstance(tree, dict) else None
     if not isinstance(information, dict):
-        raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')
+        raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {remedy}')
     return information
 
 
-def _dropped(entry: Mapping[str, str]) -> tuple[int, int]:
-    counts = [entry.get(name, '0') for name in ('samples', 'messages')]
-    samples, messages = (int(c) if c.isascii() and c.isdecimal() and len(c) < 16 else 0 for c in counts)
+def _dropped_counts(entry: Mapping[str, str]) -> tuple[int, int]:
+    """Return the numbers of samples and of messages that the recorder dropped; an invalid number counts as 0."""
+    texts = [entry.get(name, '0') for name in ('samples', 'messages')]
+    valid = [text.isascii() and text.isdecimal() and len(text) < 16 for text in texts]
+    samples, messages = (int(text) if is_valid else 0 for text, is_valid in zip(texts, valid, strict=True))
     return samples, messages
