@@ -1,7 +1,8 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder thread writes the published messages to a bag without delaying the pipeline. Messages pass through a
-bounded queue; those that do not fit are counted. A disk error or too little room ends the recording, never the run."""
+"""Writes the published messages to a bag in a separate thread, so that the disk never delays the pipeline. Messages
+pass through a bounded queue; a message that does not fit is dropped and counted. A disk error or a nearly full disk
+ends the recording, never the run."""
 
 import contextlib
 import queue
@@ -22,82 +23,87 @@ from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.realtime import SLOW, lag_reason
 
 QUEUED_PER_BLOCK = 100
-"""The queue holds this many messages for each block of ``queue_blocks``. A block makes about ten, so the disk may pause
-ten times as long as the pipeline: 50 s by default, in 25 MB."""
+"""Limit of the queue: messages for each block of ``queue_blocks``. A block (the samples of one estimate) makes about
+ten messages every 20 ms, so the default queue (25,000 messages, 25 MB) outlasts a disk that hangs for 50 s."""
 MOST_THREADS = 8
-"""Recorder threads that are alive at once, as a detached recording is still written; beyond it a start is rejected."""
+"""Limit of recorder threads: a further start is rejected. A stopped recording has a thread until its bag is closed."""
 QUEUE_BYTES = 100_000_000
-"""The recorder's queue holds no more bytes than this."""
+"""Limit of the queue in bytes, because other nodes' messages (loads, references, marks) may be long."""
 JOIN_S = 1.0
-"""At the end of the run, a recording whose queue has not shrunk for this long is given up."""
+"""Length of one wait for a recorder thread at the end of the run, s (see :func:`_wait_for_writer`)."""
 PATIENCE_S = 3.0
-"""At the end of the run, the longest wait for all recordings together."""
-
+"""At the end of the run, no wait for a recorder thread begins later than this, s; one limit for all threads."""
 IDLE_S = 0.5
+"""If no message comes for this time, s, the recorder thread flushes the bag: a crash then loses no message."""
 GATHER_S = 0.005
-"""When the queue runs empty, the recorder pauses this long to gather messages: waking up for each costs more than
-writing it. It is short enough to write before the next block (20 ms), so that no estimate is delayed."""
+"""Pause of the recorder thread when its queue runs empty, s. Messages gather meanwhile, because waking up for each
+costs more than writing it. Blocks are 20 ms apart: writing ends before the next block, and delays no estimate."""
 CHECK_EVERY = 250
-"""Messages between two checks of the file and of the room on its disk: half a second's worth."""
+"""Items written between two checks that the file is in place and the disk has room: about half a second of them."""
 
-ELSEWHERE = 'record elsewhere (parameter bag_dir)'
-
-QueuedMessage = tuple[str, str, bytes, int]
-Item = QueuedMessage | ParameterChange | None
+RECORD_ELSEWHERE = 'record elsewhere (parameter bag_dir)'
+QueuedMessage = tuple[str, str, bytes, int]  # Topic, type name, message encoded as CDR, log time in ns.
+QueueItem = QueuedMessage | ParameterChange | None  # None ends the recording.
+StateGetter = Callable[[Rig], ParameterChange | None]
+"""``Pipeline.memory``: returns the state that the next block depends on besides its samples and the rig, or None."""
 
 
 def new_folder(parent: Path, stem: str = 'psd') -> Path:
-    """A folder that does not exist yet: ``stem``, ``_`` and the time, then ``_2``, ``_3`` ..."""
+    """Return a path in ``parent`` that does not exist yet: ``STEM_DATE_TIME``, or with ``_2``, ``_3`` ... appended."""
     stem += time.strftime('_%Y%m%d_%H%M%S')
-    folder = parent / stem
-    count = 1
+    folder, number = parent / stem, 1
     while folder.exists():
-        count += 1
-        folder = parent / f'{stem}_{count}'
+        number += 1
+        folder = parent / f'{stem}_{number}'
     return folder
 
 
-class _FullError(Exception):
-    """The disk has less room than the reserve."""
+class _DiskFullError(Exception):
+    """The disk has less free space than ``disk_reserve``."""
 
 
-class _GoneError(Exception):
-    """Somebody deleted or moved the file: further messages would be lost."""
+class _FileGoneError(Exception):
+    """The file being written was deleted or moved; further messages would be lost."""
 
 
 class RecordingJob:
-    """One recording.
+    """One recording: its queue, its counters and two futures of its folder.
 
-    ``opened``: resolves to its folder once it is attached, or to the error that prevented it.
-    ``closed``: resolves to its folder once the bag is closed, or to the error that prevented it.
-    Neither can be cancelled.
+    ``opened`` is resolved when the recording is attached (see :class:`Recorder`), ``closed`` when its bag is closed. A
+    future gets the error instead if that step fails. Neither can be cancelled.
     """
 
     def __init__(self, config: AcquisitionConfig) -> None:
         self.config = config
-        self.folder: Path | None = None
-        self.attached = False
-        self.beat = time.monotonic()
-        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()  # Bound: QUEUE_BYTES.
+        self.folder: Path | None = None  # None until the bag is open.
+        self.attached = False  # Stays True when the recording is detached.
+        self.last_step_s = time.monotonic()  # Monotonic time of the recorder thread's last step, s.
+        self.queue: queue.SimpleQueue[QueueItem] = queue.SimpleQueue()  # Bound: QUEUE_BYTES.
         self.opened: Future[Path | None] = Future()
         self.closed: Future[Path | None] = Future()
-        # What waits is bounded in bytes too: messages of other nodes (loads, references, marks) may be long.
-        self.budget = ByteBudget(QUEUE_BYTES)
-        # Samples that the run had dropped when this recording began and when it ended, and messages that did not fit
-        # into the queue.
-        self.dropped_before = self.dropped_until = self.dropped_messages = 0
-        for answer in (self.opened, self.closed):
-            answer.set_running_or_notify_cancel()
+        self.budget = ByteBudget(QUEUE_BYTES)  # Bytes of the messages in the queue.
+        # Samples that the run had dropped when this recording began, and when it ended.
+        self.samples_dropped_at_start = self.samples_dropped_at_end = 0
+        self.messages_dropped = 0  # Dropped because the queue was full.
+        for future in (self.opened, self.closed):
+            future.set_running_or_notify_cancel()  # From now on cancel() has no effect.
 
 
 class Recorder:
-    """Makes one recording at a time; a sink of the fan-out. ``log`` gets a line if a recording ends by itself.
+    """A sink of :class:`psd_deflection.run.fanout.Fanout` that makes one recording at a time, each in its own thread.
 
-    ``dropped_samples``: returns the number of samples that the run had dropped before the chunk processed last; a
-    recording notes by how much it rose. ``between_blocks`` runs an action in the pipeline thread
-    (``Processing.request``). ``node``: full name of the recorded ROS node. ``dropped``: messages not recorded, over all
-    recordings of the run. ``failure``: why the last recording ended by itself, empty while all is well.
-    ``ended_early``: why each recording that ended by itself did so, by its folder.
+    A recording is *attached* between two blocks, once its bag is open; from then on :meth:`put` queues messages for it.
+    :meth:`stop` detaches it; its thread then writes the rest of the queue and closes the bag. A recording *ends early*
+    if anything but :meth:`stop` ends it, or if the rest of its queue cannot be written.
+
+    ``queue_blocks``: the rig's parameter of this name. ``log`` gets a line for the first dropped message, each deleted
+    file and each early end. ``between_blocks`` runs an action in the pipeline thread between two blocks
+    (``Processing.request``). ``dropped_samples`` returns how many samples the run had dropped before the chunk that was
+    processed last. ``node``: full name of the recorded ROS node.
+
+    ``dropped``, ``written``: messages dropped and messages written, in all recordings of the run. ``files_deleted``:
+    files deleted to make room. ``failure``: why the last recording ended early; empty once another one is attached.
+    ``ended_early``: why each recording that ended early did so, by folder.
     """
 
     def __init__(
@@ -108,160 +114,135 @@ class Recorder:
         dropped_samples: Callable[[], int] = lambda: 0,
         node: str = '',
     ) -> None:
-        self._node = node
-        self._dropped_samples = dropped_samples
-        self.dropped = 0
-        self.written = 0
-        self.files_deleted = 0
+        self.dropped = self.written = self.files_deleted = 0
         self.failure = ''
         self.ended_early: BoundedMap[Path, str] = BoundedMap()
-        self._log = log
-        self._between_blocks = between_blocks
-        self._limit = queue_blocks * QUEUED_PER_BLOCK
-        # Held to swap references and to count, never while waiting for the disk.
-        self._lock = threading.Lock()
-        # Two recordings opened in one second must not choose the same name.
-        self._naming = threading.Lock()
+        self._log, self._node = log, node
+        self._between_blocks, self._dropped_samples = between_blocks, dropped_samples
+        self._most_queued = queue_blocks * QUEUED_PER_BLOCK
+        self._lock = threading.Lock()  # Held to change attributes, never while waiting for the disk.
+        self._folder_lock = threading.Lock()  # Held until a folder is made, so that no other thread takes its name.
         self._opening: RecordingJob | None = None
-        self._job: RecordingJob | None = None
-        self._writing: dict[RecordingJob, threading.Thread] = {}  # Bound: MOST_THREADS.
-        self._threads: list[threading.Thread] = []
-        self._ended = False
+        self._attached: RecordingJob | None = None
+        # Threads that write: from the attachment of the job until its bag is closed.
+        self._writers: dict[RecordingJob, threading.Thread] = {}  # Bound: MOST_THREADS.
+        self._threads: list[threading.Thread] = []  # All recorder threads. Bound: MOST_THREADS.
+        self._run_ended = False
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the recording, or None while there is none."""
-        job = self._job
+        """Folder of the attached recording, or None."""
+        job = self._attached
         return job.folder if job is not None else None
 
     @property
     def opening(self) -> bool:
-        """Whether a recording waits for the disk to begin."""
+        """Whether a recording was started and is not attached yet."""
         return self._opening is not None
 
     @property
     def waiting(self) -> int:
-        """Messages that wait for the disk."""
-        job = self._job
+        """Number of items in the queue of the attached recording, or 0."""
+        job = self._attached
         return job.queue.qsize() if job is not None else 0
 
-    def start(
-        self,
-        rig: Rig,
-        hello: Mapping[str, object] | None,
-        memory: Callable[[Rig], ParameterChange | None],
-    ) -> Future[Path | None]:
-        """Start a recording in ``bag_dir``; the future gives its folder once it runs.
+    def start(self, rig: Rig, hello: Mapping[str, object] | None, get_state: StateGetter) -> Future[Path | None]:
+        """Start a recording in ``bag_dir``; return a future of its folder, resolved when the recording is attached.
 
-        If a recording already runs or starts, its future is returned. ``memory``: called with ``rig`` when the
-        recording is attached; returns the state of the pipeline, which is written first, or None. The future raises
-        RecordingError if the folder cannot be made, the disk has no room, or the recording was ended before the disk
-        answered; TimeoutError if no data flows.
+        If a recording is attached or opening already, return the future of that recording. ``hello``: the device's
+        description of itself, or None. ``get_state``: called at the attachment; the bag begins with its result.
+
+        The future raises RecordingError if the bag cannot be made, the disk is nearly full, ``MOST_THREADS`` threads
+        are alive, the run has ended, or :meth:`stop` is called before the bag is open; TimeoutError if no data flows.
         """
         with self._lock:
-            job = self._job or self._opening
-            if job is None:
-                job = RecordingJob(rig.acquisition)
-                if self._ended:
-                    job.opened.set_exception(RecordingError('not recorded: the run has ended'))
-                    return job.opened
-                self._threads = [thread for thread in self._threads if thread.is_alive()]
-                if len(self._threads) >= MOST_THREADS:
-                    why = f'not recorded: {MOST_THREADS} recordings wait for the disk already'
-                    job.opened.set_exception(RecordingError(why))
-                    return job.opened
-                thread = threading.Thread(
-                    target=self._run, args=(job, rig, hello, memory), name='recorder', daemon=True
-                )
-                thread.start()
-                self._threads = [*self._threads, thread]
-                self._opening = job
+            current = self._attached or self._opening
+            if current is not None:
+                return current.opened
+            job = RecordingJob(rig.acquisition)
+            self._threads = [thread for thread in self._threads if thread.is_alive()]
+            why = ''
+            if self._run_ended:
+                why = 'the run has ended'
+            elif len(self._threads) >= MOST_THREADS:
+                why = f'{MOST_THREADS} recordings wait for the disk already'
+            if why:
+                job.opened.set_exception(RecordingError(f'not recorded: {why}'))
+                return job.opened
+            thread = threading.Thread(target=self._run, args=(job, rig, hello, get_state), name='recorder', daemon=True)
+            thread.start()
+            self._threads.append(thread)
+            self._opening = job
             return job.opened
 
     def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
-        """Record one message; count it as dropped if the disk is too slow."""
-        job = self._job
+        """Queue one message for the attached recording; drop and count the message if the queue is full."""
+        job = self._attached
         if job is None:
             return
-        if job.queue.qsize() >= self._limit or not job.budget.take(len(cdr) + MESSAGE_BYTES):
-            job.dropped_messages += 1
-            self.dropped += 1
-            if self.dropped == 1:
-                self._log(f'{job.folder}: messages are dropped: {self._lag_reason(job)}', WARNING)
-        else:
+        if job.queue.qsize() < self._most_queued and job.budget.take(len(cdr) + MESSAGE_BYTES):
             job.queue.put((topic, type_name, cdr, t_ns))
+            return
+        job.messages_dropped += 1
+        self.dropped += 1
+        if self.dropped == 1:
+            self._log(f'{job.folder}: messages are dropped: {self._lag_reason(job)}', WARNING)
 
     def put_change(self, change: ParameterChange) -> None:
-        """Record a change of parameters. Never dropped: without it the replay would differ."""
-        job = self._job
+        """Queue a change of parameters even if the queue is full: without the change a replay would differ."""
+        job = self._attached
         if job is not None:
             job.queue.put(change)
 
     def stop(self) -> Future[Path | None]:
-        """Detach the recording; the future gives its folder once it is closed, None if there was none.
+        """Detach the recording; return a future of its folder, resolved when the bag is closed.
 
-        A recording that is being opened does not begin. To be called between two blocks, so that
-        the last block is whole. The future raises RecordingError if the recording could not be
-        closed.
+        The future gives None if no recording is attached; it raises RecordingError if the bag cannot be written or
+        closed. A recording that is still opening is abandoned. Call between two blocks, so that no block is cut.
         """
         with self._lock:
             opening, self._opening = self._opening, None
-            job, self._job = self._job, None
+            job, self._attached = self._attached, None
         if opening is not None:
-            opening.opened.set_exception(
-                RecordingError('the recording was ended before the disk answered; nothing was recorded')
-            )
+            why = 'the recording was ended before the disk answered; nothing was recorded'
+            opening.opened.set_exception(RecordingError(why))
         if job is not None:
-            job.dropped_until = self._dropped_samples()
+            job.samples_dropped_at_end = self._dropped_samples()
             job.queue.put(None)
             return job.closed
-        none: Future[Path | None] = Future()
-        none.set_result(None)
-        return none
+        no_recording: Future[Path | None] = Future()
+        no_recording.set_result(None)
+        return no_recording
 
     def close(self) -> Path | None:
-        """End for good; wait ``JOIN_S`` for a disk that takes nothing, ``PATIENCE_S`` for one that is slow.
+        """Reject further starts, stop the recording, and wait a limited time for the threads that still write.
 
-        Return the folder of the recording that ran, None if there was none or if its end went
-        wrong.
+        Return the folder of the attached recording; None if there is none, or if its bag cannot be written or closed.
         """
         folder = self.folder
         with self._lock:
-            self._ended = True
-        ended = self.stop()
-        until = time.monotonic() + PATIENCE_S
-        for job, thread in tuple(self._writing.items()):
-            left = job.queue.qsize() + 1
-            while thread.is_alive() and time.monotonic() < until:
-                before = left
-                thread.join(JOIN_S)
-                left = job.queue.qsize()
-                if left >= before:
-                    break
+            self._run_ended = True
+        closed = self.stop()
+        deadline_s = time.monotonic() + PATIENCE_S
+        for job, thread in tuple(self._writers.items()):
+            _wait_for_writer(job, thread, deadline_s)
             if thread.is_alive():
                 why = (
                     f'{job.folder}: {self._lag_reason(job)}; it is not waited for, and {job.budget.holders} messages '
                     f'are not written. If the file is cut off, `psd-deflection recover {job.folder}` repairs it'
                 )
                 if job.folder is not None:
-                    self._end_early(job.folder, why)
+                    self.failure = self.ended_early[job.folder] = why
                 self._log(why, WARNING)
-        return None if ended.done() and ended.exception() is not None else folder
-
-    def _end_early(self, folder: Path, why: str) -> None:
-        self.failure = self.ended_early[folder] = why
+        return None if closed.done() and closed.exception() is not None else folder
 
     def _lag_reason(self, job: RecordingJob) -> str:
-        thread = self._writing.get(job)
-        return lag_reason(thread, time.monotonic() - job.beat) if thread is not None else SLOW
+        """Return why the thread of ``job`` does not keep up."""
+        thread = self._writers.get(job)
+        return lag_reason(thread, time.monotonic() - job.last_step_s) if thread is not None else SLOW
 
-    def _run(
-        self,
-        job: RecordingJob,
-        rig: Rig,
-        hello: Mapping[str, object] | None,
-        memory: Callable[[Rig], ParameterChange | None],
-    ) -> None:
+    def _run(self, job: RecordingJob, rig: Rig, hello: Mapping[str, object] | None, get_state: StateGetter) -> None:
+        """Body of the recorder thread: open the bag, attach ``job`` between two blocks, and record."""
         try:
             bag = self._open(rig, hello)
         except Exception as error:
@@ -273,54 +254,60 @@ class Recorder:
         def attach() -> None:
             with self._lock:
                 if self._opening is not job:
-                    return
-                first = memory(rig)
-                if first is not None:
-                    job.queue.put(first)
-                self._writing[job] = thread
-                job.dropped_before = job.dropped_until = self._dropped_samples()
-                self._opening, self._job, job.attached, self.failure = None, job, True, ''
+                    return  # Stopped or rejected.
+                state = get_state(rig)
+                if state is not None:
+                    job.queue.put(state)
+                self._writers[job] = thread
+                job.samples_dropped_at_start = job.samples_dropped_at_end = self._dropped_samples()
+                self._opening, self._attached = None, job
+                job.attached, self.failure = True, ''
 
         try:
             self._between_blocks(attach)
         except Exception as error:
             self._reject(job, error)
-        if not job.attached:
+        if not job.attached:  # A request that timed out may still have attached the job.
             with contextlib.suppress(OSError, RecordingError):
                 bag.discard()
             return
         job.opened.set_result(bag.folder)
         why = self._record(job, bag)
-        del self._writing[job]
+        del self._writers[job]
         if not why:
             job.closed.set_result(bag.folder)
             return
-        self._end_early(bag.folder, why)
+        self.failure = self.ended_early[bag.folder] = why
         self._log(f'recording stopped: {why}', ERROR)
         job.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
+        """Return a new bag in ``bag_dir``. Raises RecordingError if the disk is nearly full or rejects the bag."""
         config = rig.acquisition
-        with self._naming:
+        # Only complete files older than bag_keep are deleted: without bag_max_duration, a file spans a seventh of it.
+        file_s = config.bag_max_duration or config.bag_keep / 7.0
+        with self._folder_lock:
             folder = new_folder(Path(config.bag_dir).expanduser())
-            missing = why_full(_nearest(folder), config.disk_reserve)
-            if missing:
-                raise RecordingError(f'{folder}: {missing}; make room, or {ELSEWHERE}')
+            # The folder does not exist yet: its disk is that of the nearest parent.
+            existing = next((path for path in (folder, *folder.absolute().parents) if path.exists()), Path('/'))
+            why = why_full(existing, config.disk_reserve)
+            if why:
+                raise RecordingError(f'{folder}: {why}; make room, or {RECORD_ELSEWHERE}')
             try:
                 return BagWriter(
                     folder,
                     rig_values=rig.flat(),
                     device_hello=hello,
                     max_bytes=config.bag_max_bytes,
-                    max_s=config.bag_max_duration or config.bag_keep / 7.0,
+                    max_s=file_s,
                     durable=True,
                     node=self._node,
                 )
             except RecordingError as error:
-                raise RecordingError(f'{error}; {ELSEWHERE}') from None
+                raise RecordingError(f'{error}; {RECORD_ELSEWHERE}') from None
 
     def _reject(self, job: RecordingJob, error: Exception) -> None:
-        """Resolve ``job.opened`` with an error, unless it is resolved already."""
+        """Resolve ``job.opened`` with ``error``, unless ``job`` was attached or stopped meanwhile."""
         with self._lock:
             if self._opening is not job:
                 return
@@ -328,26 +315,20 @@ class Recorder:
         job.opened.set_exception(error)
 
     def _record(self, job: RecordingJob, bag: BagWriter) -> str:
-        """Write until the end, and close; return '' or why the recording ended early."""
+        """Write the queue to the bag until the recording ends, and close the bag; return why it ended early, or ''."""
         try:
             try:
-                try:
-                    self._write(bag, job)
-                finally:
-                    # Before the slow close: a new start must not get this recording's future.
-                    with self._lock:
-                        if self._job is job:
-                            self._job = None
-            except _FullError as error:
-                # The reserve leaves room for index and summary.
+                self._write_and_detach(job, bag)
+            except _DiskFullError as error:
+                # disk_reserve leaves room for the bag's index and summary.
                 bag.close()
                 return f'{bag.folder}: {error}; it is complete up to here'
             _require_in_place(bag)
-            samples = job.dropped_until - job.dropped_before
-            if samples or job.dropped_messages:
-                bag.note_dropped(samples, job.dropped_messages)
+            samples = job.samples_dropped_at_end - job.samples_dropped_at_start
+            if samples or job.messages_dropped:
+                bag.note_dropped(samples, job.messages_dropped)
             bag.close()
-        except _GoneError as error:
+        except _FileGoneError as error:
             with contextlib.suppress(RecordingError):
                 bag.close()
             return str(error)
@@ -356,55 +337,68 @@ class Recorder:
                 bag.close()
             return f'{error}; `psd-deflection recover {bag.folder}` makes it whole'
         except Exception as error:
-            # Any error at all: a recorder that died without a message would be worse.
+            # Any other error is reported too: a thread that died would end the recording without a message.
             with contextlib.suppress(Exception):
                 bag.close()
             return f'{bag.folder}: {type(error).__name__}: {error}'
         return ''
 
-    def _write(self, bag: BagWriter, job: RecordingJob) -> None:
-        items, config = job.queue, job.config
-        since_check = 0
-        unflushed = draining = False
+    def _write_and_detach(self, job: RecordingJob, bag: BagWriter) -> None:
+        try:
+            self._write(job, bag)
+        finally:
+            # Closing the bag may be slow: a start in that time must not get the future of this job.
+            with self._lock:
+                if self._attached is job:
+                    self._attached = None
+
+    def _write(self, job: RecordingJob, bag: BagWriter) -> None:
+        """Write the items of the queue up to the None that ends the recording."""
+        items_since_check = 0
+        unflushed = False  # Whether items were written since the last flush.
+        queue_had_item = False  # Whether the last attempt to get an item succeeded.
         while True:
-            job.beat = time.monotonic()
+            job.last_step_s = time.monotonic()
             try:
-                item = items.get_nowait() if draining else items.get(timeout=IDLE_S)
+                item = job.queue.get_nowait() if queue_had_item else job.queue.get(timeout=IDLE_S)
             except queue.Empty:
-                if draining:
+                if queue_had_item:
                     time.sleep(GATHER_S)
                 elif unflushed:
                     bag.flush()
                     unflushed = False
-                draining = False
+                queue_had_item = False
                 continue
-            draining = True
+            queue_had_item = True
             if item is None:
                 return
             if isinstance(item, ParameterChange):
                 bag.put(item)
             else:
-                bag.write_encoded(*item)
-                job.budget.give_back(len(item[2]) + MESSAGE_BYTES)
+                topic, type_name, cdr, t_ns = item
+                bag.write_encoded(topic, type_name, cdr, t_ns)
+                job.budget.give_back(len(cdr) + MESSAGE_BYTES)
                 with self._lock:
                     self.written += 1
             unflushed = True
-            since_check += 1
-            if since_check >= CHECK_EVERY:
-                since_check = 0
+            items_since_check += 1
+            if items_since_check >= CHECK_EVERY:
+                items_since_check = 0
                 _require_in_place(bag)
-                self._make_room(bag, config)
+                self._make_room(bag, job.config)
 
     def _make_room(self, bag: BagWriter, config: AcquisitionConfig) -> None:
+        """Delete files older than ``bag_keep``; if the disk is nearly full, do as ``disk_full`` says."""
         while 0.0 < config.bag_keep < bag.oldest_age_s:
             self._drop_oldest(bag, f'it ended more than bag_keep = {config.bag_keep:g} s ago')
-        while missing := why_full(bag.folder, config.disk_reserve):
+        while why := why_full(bag.folder, config.disk_reserve):
             if config.disk_full != 'delete_oldest':
-                raise _FullError(missing)
-            if not self._drop_oldest(bag, f'{missing} (disk_full is delete_oldest)', WARNING):
-                raise _FullError(f'{missing} and there is no older file of this recording to delete')
+                raise _DiskFullError(why)
+            if not self._drop_oldest(bag, f'{why} (disk_full is delete_oldest)', WARNING):
+                raise _DiskFullError(f'{why} and there is no older file of this recording to delete')
 
     def _drop_oldest(self, bag: BagWriter, why: str, level: int = INFO) -> bool:
+        """Delete the oldest complete file of the bag and log ``why``; return False if there is no such file."""
         deleted = bag.drop_oldest()
         if deleted is not None:
             self.files_deleted += 1
@@ -412,23 +406,29 @@ class Recorder:
         return deleted is not None
 
 
+def _wait_for_writer(job: RecordingJob, thread: threading.Thread, deadline_s: float) -> None:
+    """Wait until ``thread`` ends, the queue of ``job`` stops shrinking, or ``deadline_s`` (monotonic time) passes."""
+    # With the 1 added, the first wait counts as progress: the thread may be closing the bag.
+    remaining = job.queue.qsize() + 1
+    while thread.is_alive() and time.monotonic() < deadline_s:
+        before = remaining
+        thread.join(JOIN_S)
+        remaining = job.queue.qsize()
+        if remaining >= before:
+            return
+
+
 def _require_in_place(bag: BagWriter) -> None:
     if not bag.in_place:
-        raise _GoneError(f'{bag.path}: was deleted or moved while it was recorded; start another recording')
-
-
-def _nearest(folder: Path) -> Path:
-    """The folder itself, or its nearest parent that exists."""
-    return next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path('/'))
+        raise _FileGoneError(f'{bag.path}: was deleted or moved while it was recorded; start another recording')
 
 
 def why_full(folder: Path, reserve: int) -> str:
-    """Why the disk of ``folder`` is too full (less than ``reserve`` bytes left); '' if it is not."""
+    """Return why the disk of ``folder`` is too full; '' if ``reserve`` bytes are free or the free space is unknown."""
     try:
         free = shutil.disk_usage(folder).free
     except OSError:
-        # The free space is not known: messages are written until a write fails.
-        return ''
+        return ''  # Messages are written until a write fails.
     if free >= reserve:
         return ''
     return f'the disk has {free / 1e6:.0f} MB left, less than disk_reserve = {reserve / 1e6:.0f} MB'

@@ -82,8 +82,8 @@ def test_part_that_hangs_delays_end_by_two_seconds(
     owner = cast(Any, getattr(session, part))
     hanging = Hanging()
     if part == 'recorder':
-        [(take, thread)] = owner._writing.items()
-        owner._writing[take] = hanging
+        [(take, thread)] = owner._writers.items()
+        owner._writers[take] = hanging
     else:
         thread = owner._thread
         owner._thread = hanging
