@@ -55,10 +55,10 @@ LEFT = (
 
 
 def one_line(root: Path) -> str:
-    """The line of docs/quickstart.md that goes from a checkout to the live page by pip."""
-    found = re.search(r'^python3 -m venv .+ monitor$', (root / 'docs/quickstart.md').read_text(), re.M)
+    """The line of README.md that goes from a checkout to the live page by pip."""
+    found = re.search(r'^python3 -m venv .+ monitor$', (root / 'README.md').read_text(), re.M)
     if found is None:
-        raise ValueError('docs/quickstart.md: no line `python3 -m venv ... monitor`')
+        raise ValueError('README.md: no line `python3 -m venv ... monitor`')
     return found[0]
 
 

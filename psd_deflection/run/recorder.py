@@ -288,10 +288,7 @@ class Recorder:
         file_s = config.bag_max_duration or config.bag_keep / 7.0
         with self._folder_lock:
             folder = new_folder(Path(config.bag_dir).expanduser())
-            # The folder does not exist yet: its disk is that of the nearest parent.
-            existing = next((path for path in (folder, *folder.absolute().parents) if path.exists()), Path('/'))
-            why = why_full(existing, config.disk_reserve)
-            if why:
+            if why := why_full(folder, config.disk_reserve):
                 raise RecordingError(f'{folder}: {why}; make room, or {RECORD_ELSEWHERE}')
             try:
                 return BagWriter(
@@ -424,9 +421,13 @@ def _require_in_place(bag: BagWriter) -> None:
 
 
 def why_full(folder: Path, reserve: int) -> str:
-    """Return why the disk of ``folder`` is too full; '' if ``reserve`` bytes are free or the free space is unknown."""
+    """Return why the disk of ``folder`` is too full; '' if ``reserve`` bytes are free or the free space is unknown.
+
+    A folder that does not exist yet is on the disk of its nearest parent.
+    """
+    existing = next((path for path in (folder, *folder.absolute().parents) if path.exists()), Path('/'))
     try:
-        free = shutil.disk_usage(folder).free
+        free = shutil.disk_usage(existing).free
     except OSError:
         return ''  # Messages are written until a write fails.
     if free >= reserve:

@@ -4,10 +4,10 @@
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,8 +162,9 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_disk_without_room_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = SimpleNamespace(free=1_000_000)
-    monkeypatch.setattr('psd_deflection.run.recorder.shutil', cast(Any, SimpleNamespace(disk_usage=lambda _: usage)))
+    usage = shutil.disk_usage
+    # As the system has it: of a folder that does not exist there is no figure.
+    monkeypatch.setattr(shutil, 'disk_usage', lambda path: usage(path)._replace(free=1_000_000))
     chain = Chain(tmp_path)
     chain.bump()
     assert chain.watcher.close(60.0) == ''
