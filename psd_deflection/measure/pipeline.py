@@ -14,7 +14,7 @@ from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.averaging import BlockCutter, BlockMeasures, measured, middles_ns, of_one_length
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
-from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Estimation, ValidBlock
+from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockInput, BlockSolution, Estimation
 from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.motion.modal import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
@@ -365,7 +365,7 @@ class Pipeline:
             blocks = blocks[done:]
 
     def _block(
-        self, block: SampleBlock, measures: BlockMeasures, observed: ValidBlock, readings: BlockReadings | None
+        self, block: SampleBlock, measures: BlockMeasures, observed: BlockInput, readings: BlockReadings | None
     ) -> Iterator[Record]:
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
@@ -374,7 +374,8 @@ class Pipeline:
         solvable = verdict.status is BlockStatus.OK or verdict.sound
         answer = self.estimation.solve(observed, readings) if solvable else BlockSolution(observed.means)
         self.last_estimate = answer.estimate
-        self.estimator.record(answer.used and answer.used.readings.fitted, self.estimation.excluded(answer.used))
+        fitted = None if answer.solved is None else answer.solved.readings.fitted
+        self.estimator.record(fitted, self.estimation.excluded_psds(answer.solved))
         status, reason = answer.failure or (verdict.status, verdict.reason)
         self._count(status, verdict, answer)
         yield from self._estimates(observed, answer, status)
@@ -392,12 +393,12 @@ class Pipeline:
             reason=reason,
             findings=findings,
             excluded=self.estimator.excluded,
-            published=observed.due,
+            published=observed.fully_published,
         )
         yield self.last_spots
         yield block
 
-    def _classified(self, blocks: Sequence[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[ValidBlock]:
+    def _classified(self, blocks: Sequence[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[BlockInput]:
         """The dots of each block, and whether lasers and detectors are sound."""
         frozen = self._stillness.blocks
         size = self._cutter.block_size
@@ -405,7 +406,7 @@ class Pipeline:
         middles = middles_ns(seq, t_ns, size, self._period_ns)
         for block, own, slots, middle in zip(blocks, measures, seq % size, middles, strict=True):
             frozen = self._optics.frozen(frozen, own)
-            yield ValidBlock(
+            yield BlockInput(
                 t_ns=middle,
                 index=block.index,
                 slots=slots,
@@ -414,7 +415,7 @@ class Pipeline:
                 mean_sums=own.mean_sums,
                 verdict=self._optics.classify(block, own, frozen),
                 frozen=frozen,
-                due=block.index % self.rig.estimator.decimation == 0,
+                fully_published=block.index % self.rig.estimator.decimation == 0,
             )
 
     def _count(self, status: BlockStatus, verdict: Verdict, answer: BlockSolution) -> None:
@@ -427,50 +428,50 @@ class Pipeline:
         counters.estimates += 1
         counters.degraded += verdict.status is not BlockStatus.OK or not answer.complete
 
-    def _estimates(self, observed: ValidBlock, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
+    def _estimates(self, observed: BlockInput, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
         """The primary estimate first, then its load, the motion and the other solvers' estimates."""
-        best, used = answer.estimate, answer.used
+        best, solved = answer.estimate, answer.solved
         if best is not None:
             yield best
-            if used is not None:
+            if solved is not None:
                 load = self.tip_loads.tip_load(observed.index, best.dx, best.dy, best.theta)
-                if observed.due:
+                if observed.fully_published:
                     yield TipLoad(observed.t_ns, *load)
         if self.motion_filter is not None:
             # A pose without all PSDs has other noise than the filter is set for: it predicts only.
             usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and answer.complete)
             # A block without a fit does not say which tones it follows.
-            tones = self.estimator.noise.tones if used is None else self.estimator.vibrating
+            tones = self.estimator.noise.tones if answer.solved is None else self.estimator.vibrating
             moved = self._moved(self.motion_filter, observed, usable, tones)
             if moved is not None:
                 yield moved
         self._keep_for_zero(observed, answer)
-        if observed.due and best is not None and used is not None:
-            yield from self.estimation.other_estimates(observed, used)
+        if observed.fully_published and best is not None and solved is not None:
+            yield from self.estimation.other_estimates(observed, solved)
 
-    def _keep_for_zero(self, observed: ValidBlock, answer: BlockSolution) -> None:
+    def _keep_for_zero(self, observed: BlockInput, answer: BlockSolution) -> None:
         """Keep the dots of the last good blocks; a zero must not be a mean across an outage."""
-        if answer.estimate is None or answer.used is None or not answer.complete:
+        if answer.estimate is None or answer.solved is None or not answer.complete:
             self._recent.clear()
             return
         last = self.last_spots
         if last is not None and observed.t_ns - last.t_ns > ZERO_BLOCKS * self._cutter.block_size * self._period_ns:
             self._recent.clear()
-        self._recent.append((observed.t_ns, answer.used.readings.dots))
+        self._recent.append((observed.t_ns, answer.solved.readings.dots))
 
     def _findings(
-        self, measures: BlockMeasures, observed: ValidBlock, answer: BlockSolution, status: BlockStatus
+        self, measures: BlockMeasures, observed: BlockInput, answer: BlockSolution, status: BlockStatus
     ) -> tuple[str, ...]:
         """Return the findings of a block; from a good block without any, the noise is learnt."""
-        findings, used = observed.verdict.findings, answer.used
-        if used is not None and used.excluded:
-            findings = (*findings, f'psd_{used.excluded} contradicts the others and is left out')
+        findings, solved = observed.verdict.findings, answer.solved
+        if solved is not None and solved.excluded_psd:
+            findings = (*findings, f'psd_{solved.excluded_psd} contradicts the others and is left out')
         # Before learning: what this block teaches applies from the next one on.
         vibrates = self.estimator.vibrates
         if status is BlockStatus.OK and not findings:
             self._learn(observed, measures)
-        if answer.complete and used is not None and used.checked is not None:
-            self.estimator.search_outliers(observed.index, used.readings.dots, used.checked)
+        if answer.complete and solved is not None and solved.check_result is not None:
+            self.estimator.search_outliers(observed.index, solved.readings.dots, solved.check_result)
         findings += self._optics.late_findings(measures, observed.verdict, observed.frozen, self._loudness)
         if vibrates:
             findings += (f'vibrates: {vibrates}',)
@@ -479,7 +480,7 @@ class Pipeline:
         self.counters.count_findings(findings)
         return findings
 
-    def _learn(self, observed: ValidBlock, measures: BlockMeasures) -> None:
+    def _learn(self, observed: BlockInput, measures: BlockMeasures) -> None:
         """Update the measured noise with a good block, and the filter with the noise."""
         changed = self.estimator.learn(observed.index, observed.slots, observed.samples, measures.volts)
         if not changed:
@@ -489,7 +490,7 @@ class Pipeline:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
 
     def _moved(
-        self, motion: ModalFilter, observed: ValidBlock, usable: bool, tones: Sequence[Tone]
+        self, motion: ModalFilter, observed: BlockInput, usable: bool, tones: Sequence[Tone]
     ) -> TipMotion | None:
         """The motion by the filter; ``usable``: whether samples of the block can be used; ``tones``: not followed."""
         slots, poses = observed.slots, None
