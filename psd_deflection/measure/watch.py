@@ -1,18 +1,19 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Watches the records of a run for the moment from which the rig is no longer what its model says.
+"""Detects from the records of a run when the rig no longer matches its model (terms: ``docs/glossary.md``).
 
-Three tests, each on means over windows of half a second that are not spoilt by motion:
+A reading is one coordinate of a dot (x1, y1, x2, y2 ..., m). A window is half a second of consecutive blocks, each with
+an estimate from all PSDs. Windows during motion are skipped. Three tests compare the means of the other windows:
 
-* **readings**, if the load is known: while it is held, the readings must not shift. Each of x1 y1 x2 y2 ... has a
-  two-sided CUSUM (Page, Biometrika 41 (1954) 100) against the level that it had under this load.
-* **base line**: the distance of the dots of two PSDs is that of their beams under every load and in motion. Its CUSUM
-  needs no load.
-* **load**, if it is known: from one load to the next the pose must move as the link model says, within ``SHARE``.
+* **Readings**: while a known load acts, each reading must keep the level of its first windows under this load.
+* **Base line**: the distance between the dots of two PSDs, minus the distance between their beams, must keep its level.
+  This difference depends neither on load nor on pose, so the test needs no known load.
+* **Load**: from one known load to the next, the pose must move as the link model predicts.
 
-A CUSUM counts what exceeds ``allowed``: two standard deviations of a window's mean, and at least the rig's
-``watch_wander``. The level follows slow drift. The alarm comes ``CONFIRM_S`` later, unless a load is noted meanwhile:
-people note a load after they have put it on. The object owns no clock and no thread; the same records give the same
+The first two tests are two-sided CUSUMs (Page, Biometrika 41 (1954) 100) with a dead zone: twice the standard deviation
+of a window's mean or the parameter ``watch_wander``, whichever is larger. After a sum has exceeded ``ALARM_SUM``, the
+alarm waits for ``CONFIRM_S``: people annotate a load after they have applied it, and a new load cancels the alarm.
+Without a known load, the alarm does not wait. No test uses a clock or a thread, so the same records cause the same
 alarms, live and in replay.
 """
 
@@ -39,36 +40,48 @@ from psd_deflection.rig.declarations import ZEROS
 from psd_deflection.rig.parameter_files import EFFECTS_PREFIX
 
 WINDOW_S = 0.5
-LEARN = 4
-"""Windows from which a level is learned."""
-REMEMBER = 60
-"""Windows whose scatter tells what is usual."""
-MOVING = 3.0
-"""A window that scatters by more than this factor of the usual is spoilt by motion."""
-SIGMAS = 2.0
-"""Standard deviations of a window's mean that are never counted."""
-ALARM = 10.0
-"""Sum of what was counted, in standard deviations, from which it is an alarm. For normal windows two sums of this limit
-give one in more than 10^15 windows; no window counts more than ``MOST``."""
-MOST = 8.0
+"""Length of a window, s (at least five blocks)."""
+LEVEL_WINDOWS = 4
+"""Number of windows from which a level is learned, and after which the noise counts as known."""
+HISTORY_WINDOWS = 60
+"""Number of recent windows from which the noise is estimated: half a minute."""
+MOTION_FACTOR = 3.0
+"""A window contains motion if its scatter exceeds the usual scatter by this factor. The scatter is the standard
+deviation of the window's blocks; the usual scatter is the lower quartile over recent windows."""
+DEAD_ZONE_SIGMAS = 2.0
+"""Smallest dead zone of a CUSUM, in standard deviations of a window's mean."""
+ALARM_SUM = 10.0
+"""CUSUM above which a channel counts as shifted, in standard deviations of a window's mean. Independent normal noise
+lifts a channel's two sums to this limit less than once in 10^15 windows."""
+MAX_SUM = 3.0 * ALARM_SUM
+"""Upper limit of a sum, so that the sum falls below ``ALARM_SUM`` soon after a shift has ended."""
+MAX_INCREMENT = 8.0
+"""Largest change of a sum by one window. A single outlier cannot lift a sum from 0 to ``ALARM_SUM``."""
+MIN_SD = 1e-9
+"""Lower limit of a standard deviation, m, for readings without noise."""
 CONFIRM_S = 3.0
-FORGET = 1.0 / 120.0
-"""Share of a window in the level: it follows drift in a minute."""
-RELATIVE = 0.002
-"""Share of the movement by which the base line may be wrong in a sound rig: discover believes its simulation as far."""
-SHARE = 0.02
-"""Share of the movement by which the pose under a known load may be off the link model."""
-OFF, OFF_TWIST = 5e-6, 40e-6
-"""What it may be off besides, m and rad."""
-BACK = 20
-"""Windows at the old level after which an alarm ends."""
+"""Delay of an alarm, s: a load may be annotated this late."""
+LEVEL_GAIN = 1.0 / 120.0
+"""Weight of a new window in the level while both sums are 0: the level follows drift with a time constant of 60 s."""
+BASE_LINE_FRACTION = 0.002
+"""Fraction of the tip's movement that is added to ``watch_wander`` for base lines; ``discover`` permits the same."""
+POSE_TOLERANCES = {'dx': 5e-6, 'dy': 5e-6, 'theta': 40e-6}
+"""Permitted error of the link model at zero movement: m, m, rad."""
+POSE_FRACTION = 0.02
+"""Permitted further error of the link model, as a fraction of the movement from one load to the next."""
+TOLERANCE_SIGMAS = 6.0
+"""Ratio of tolerance to standard deviation in an alarm of the load test, which measures no standard deviation."""
+RECOVERY_WINDOWS = 20
+"""Number of successive windows without a shifted channel after which an alarm ends: ten seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """``since_ns``: when it began; ``observed_ns``: when it was sure. ``channel``: of the readings, the base line of
-    two PSDs, or an axis of the pose. ``shift`` and ``sd``, m or rad. ``sigmas``: how many standard deviations it is.
-    ``also``: other channels that shifted.
+    """A mismatch between rig and model, which began at ``since_ns`` and was certain at ``observed_ns``.
+
+    ``channel``: a reading (``x1``), a base line (``base line of psd_1 and psd_2``) or, from the load test, a coordinate
+    of the pose (``dx``, ``dy``, ``theta``). ``shift`` of the channel and its standard deviation ``sd``: m, rad for
+    ``theta``. ``also``: names of the channels with smaller shifts.
     """
 
     since_ns: int
@@ -80,12 +93,12 @@ class Alarm:
 
     @property
     def sigmas(self) -> float:
-        """The shift in standard deviations."""
+        """Return the absolute shift in standard deviations."""
         return abs(self.shift) / max(self.sd, 1e-12)
 
     @property
     def words(self) -> str:
-        """What is seen, without the time."""
+        """Return the alarm as a sentence without the time."""
         unit = 'µrad' if self.channel == 'theta' else 'µm'
         also = f'; {", ".join(self.also)} too' if self.also else ''
         return (
@@ -95,207 +108,208 @@ class Alarm:
 
 
 def alarm_sentences(alarms: Sequence[Alarm], start_ns: int, watched: str) -> list[str]:
-    """Each alarm with its time from ``start_ns``; or that there was none, and what was ``watched``."""
+    """Return a sentence per alarm, timed in s from ``start_ns``; without alarms, one that names what is ``watched``."""
     lines = [f'since {(alarm.since_ns - start_ns) / 1e9:.1f} s: {alarm.words}' for alarm in alarms]
     return lines or [f'the rig is its model; watched: {watched}']
 
 
-class _Window(NamedTuple):
-    mean: float
-    scatter: float
+class _PoseWindow(NamedTuple):
+    """Start and end of a window, and its means of ``pose`` and ``deviation``, each (3,): dx m, dy m, theta rad.
+
+    ``deviation``: estimated pose minus the pose that the link model predicts for the annotated load.
+    """
+
+    start_ns: int
+    end_ns: int
+    pose: list[float]
+    deviation: list[float]
 
 
 class _Channel:
-    """One number a block: its windows, its level, and its two sums."""
+    """A monitored scalar, m: its windows of ``blocks`` blocks, its level and its two CUSUMs.
 
-    def __init__(self, name: str) -> None:
+    ``mean``: mean of the last complete window, m. ``still``: whether that window was free of motion. ``level``: m, None
+    until known. ``shifted``: whether a CUSUM exceeds ``ALARM_SUM``, and ``since_ns``: when that CUSUM became positive.
+    """
+
+    def __init__(self, name: str, blocks: int) -> None:
         self.name = name
-        self._sum = self._squares = self._first = 0.0
-        self._count = 0
-        self._scatters: deque[float] = deque(maxlen=REMEMBER)
-        self._steps: deque[float] = deque(maxlen=REMEMBER)
-        self._last: float | None = None
-        self._sigma = 0.0
-        self.forget()
+        self.mean = self._first_value = self._usual_scatter = self._mean_sd = 0.0
+        self.still = False
+        self._blocks = blocks
+        self._scatters: deque[float] = deque(maxlen=HISTORY_WINDOWS)
+        self._mean_steps: deque[float] = deque(maxlen=HISTORY_WINDOWS)
+        self.forget_level()
+        self.discard_window()
 
-    def forget(self) -> None:
-        """Learn the level anew."""
-        self._learned: list[float] = []  # Bound: LEARN.
+    def forget_level(self) -> None:
+        """Reset the level and the CUSUMs; the estimates of the noise stay."""
+        self._level_means: list[float] = []  # Bound: LEVEL_WINDOWS.
         self.level: float | None = None
-        self._up = self._down = 0.0
-        self._up_ns = self._down_ns = 0
-        self._since: list[float] = []  # Bound: REMEMBER.
-        self._last = None
+        self._last_mean: float | None = None
+        # CUSUMs of upward and downward shifts, and the start of the window in which each last became positive.
+        self._sums, self._sums_since_ns = [0.0, 0.0], [0, 0]
+        self.shifted, self.since_ns = False, 0
+        self._shifted_means: deque[float] = deque(maxlen=LEVEL_WINDOWS)
+
+    def discard_window(self) -> None:
+        """Forget the blocks of the current window."""
+        self._sum = self._squares = 0.0
+        self._count = 0
 
     def add(self, value: float) -> None:
-        """The value of a block."""
+        """Add the value of a block, m, to the current window."""
         if not self._count:
-            self._first = value
-        value -= self._first
+            self._first_value = value
+        value -= self._first_value  # Small values keep the sum of squares accurate.
         self._sum += value
         self._squares += value * value
         self._count += 1
 
-    def drop(self) -> None:
-        """Begin the window again."""
-        self._sum = self._squares = 0.0
-        self._count = 0
+    def finish_window(self) -> None:
+        """Set ``mean`` and ``still`` from the current window."""
+        mean = self._sum / self._count
+        scatter = math.sqrt(max(self._squares / self._count - mean * mean, 0.0))
+        self._scatters.append(scatter)
+        # The lower quartile is the scatter of the noise, even if most windows contain motion.
+        self._usual_scatter = sorted(self._scatters)[len(self._scatters) // 4]
+        small = scatter <= MOTION_FACTOR * max(self._usual_scatter, MIN_SD)
+        self.still = small and len(self._scatters) >= LEVEL_WINDOWS
+        self.mean = self._first_value + mean
 
-    def close(self) -> _Window:
-        """The window's mean and scatter; the next begins."""
-        n = self._count
-        mean = self._sum / n
-        scatter = math.sqrt(max(self._squares / n - mean * mean, 0.0))
-        out = _Window(self._first + mean, scatter)
-        self.drop()
-        return out
+    def update(self, start_ns: int, tolerance: float) -> bool:
+        """Use ``mean`` for the level or, if the level is known, for the CUSUMs. Return whether the level became known.
 
-    def still(self, window: _Window) -> bool:
-        """Whether the window is not spoilt by motion."""
-        self._scatters.append(window.scatter)
-        usual = sorted(self._scatters)[len(self._scatters) // 4]
-        return len(self._scatters) >= LEARN and window.scatter <= MOVING * max(usual, 1e-9)
-
-    def sigma(self, blocks: int) -> float:
-        """Standard deviation of a window's mean, m: from the scatter, or from window to window if that is more."""
-        usual = sorted(self._scatters)[len(self._scatters) // 4] / math.sqrt(blocks)
-        steps = 1.4826 * statistics.median(self._steps) / math.sqrt(2.0) if len(self._steps) >= LEARN else 0.0
-        return max(usual, steps, 1e-9)
-
-    def learn(self, mean: float) -> bool:
-        """Take a window into the level; whether the level is known now."""
-        self._learned.append(mean)
-        if len(self._learned) < LEARN:
-            return False
-        self.level = statistics.median(self._learned)
-        return True
-
-    def count(self, mean: float, began_ns: int, blocks: int, least: float) -> float:
-        """A window's mean: the greater of the two sums. ``least``: shift that is not counted whatever the noise, m."""
-        if self._last is not None:
-            self._steps.append(abs(mean - self._last))
-        self._last = mean
-        self._sigma = sigma = self.sigma(blocks)
-        level = self.level
-        if level is None:
-            return 0.0
-        allowed = max(SIGMAS * sigma, least)
-        z = (mean - level) / sigma
-        k = allowed / sigma
-        up = max(0.0, self._up + min(max(z - k, -MOST), MOST))
-        down = max(0.0, self._down + min(max(-z - k, -MOST), MOST))
-        if up > 0.0 and self._up == 0.0:
-            self._up_ns = began_ns
-        if down > 0.0 and self._down == 0.0:
-            self._down_ns = began_ns
-        if up > 0.0 or down > 0.0:
-            self._since.append(mean)
-            del self._since[:-REMEMBER]
+        ``start_ns``: start of the window. ``tolerance``: smallest dead zone, m.
+        """
+        if self.level is None:
+            self._level_means.append(self.mean)
+            if len(self._level_means) < LEVEL_WINDOWS:
+                return False
+            self.level = statistics.median(self._level_means)
+            return True
+        if self._last_mean is not None:
+            self._mean_steps.append(abs(self.mean - self._last_mean))
+        self._last_mean = self.mean
+        self._mean_sd = sd = self._sd_of_mean()
+        dead_zone = max(DEAD_ZONE_SIGMAS * sd, tolerance) / sd  # In standard deviations, as z.
+        z = (self.mean - self.level) / sd
+        for i, excess in enumerate((z - dead_zone, -z - dead_zone)):
+            increment = min(max(excess, -MAX_INCREMENT), MAX_INCREMENT)
+            new_sum = max(0.0, self._sums[i] + increment)
+            if new_sum > 0.0 and self._sums[i] == 0.0:
+                self._sums_since_ns[i] = start_ns
+            self._sums[i] = min(new_sum, MAX_SUM)
+        larger = max(self._sums)
+        self.shifted, self.since_ns = larger > ALARM_SUM, self._sums_since_ns[self._sums.index(larger)]
+        if larger > 0.0:
+            self._shifted_means.append(self.mean)
         else:
-            self._since.clear()
-            self.level = level + FORGET * (mean - level)
-        self._up, self._down = min(up, 3.0 * ALARM), min(down, 3.0 * ALARM)
-        return max(self._up, self._down)
+            self._shifted_means.clear()
+            self.level += LEVEL_GAIN * (self.mean - self.level)
+        return False
 
-    @property
-    def beyond(self) -> bool:
-        """Whether a sum is beyond the alarm."""
-        return max(self._up, self._down) > ALARM
-
-    @property
-    def since_ns(self) -> int:
-        """When the shift began."""
-        return self._up_ns if self._up >= self._down else self._down_ns
+    def _sd_of_mean(self) -> float:
+        """Return the standard deviation of a window's mean, m: the larger estimate from scatter or successive means."""
+        from_scatter = self._usual_scatter / math.sqrt(self._blocks)
+        from_steps = 0.0
+        if len(self._mean_steps) >= LEVEL_WINDOWS:
+            # Normal noise: 1.4826 times the median is the deviation of a step, which is sqrt(2) times that of a mean.
+            from_steps = 1.4826 * statistics.median(self._mean_steps) / math.sqrt(2.0)
+        return max(from_scatter, from_steps, MIN_SD)
 
     def shift(self) -> tuple[float, float]:
-        """The shift and its standard deviation, m."""
-        if not self._since or self.level is None:
-            return 0.0, self._sigma
-        middle = statistics.median(self._since[-LEARN:])
-        return middle - self.level, self._sigma * math.sqrt(1.0 / min(len(self._since), LEARN) + 1.0 / LEARN)
+        """Return the shift of the last means from the level, and the standard deviation of the shift, m."""
+        n = len(self._shifted_means)
+        if not n or self.level is None:
+            return 0.0, self._mean_sd
+        shift = statistics.median(self._shifted_means) - self.level
+        return shift, self._mean_sd * math.sqrt(1.0 / n + 1.0 / LEVEL_WINDOWS)
 
 
 class Watch:
-    """Takes the records of a run in order. ``compliance``: deflection for 1 N, 1 N, 1 N m at the tip: m/N, m/N,
-    rad/(N m). ``alarm``: what is wrong now, or None. ``alarms``: how many there were.
+    """Runs the three tests on the records of a run.
+
+    ``compliance``: deflection of the tip per load, m/N, m/N, rad/(N m). ``load``: the known load or None. ``alarm``:
+    the present alarm or None. ``alarms``, ``windows``: numbers of alarms and of windows so far. ``spoilt``: number of
+    windows with motion in a reading, plus the first three windows, in which the usual scatter is not yet known.
     """
 
     def __init__(self, rig: Rig, compliance: Sequence[float]) -> None:
+        self.load: AppliedLoad | None = None
+        self.alarms = self.windows = self.spoilt = 0
         self._compliance = tuple(compliance)
-        self._allowed_drift = rig.acquisition.watch_wander
+        self._drift_tolerance = rig.acquisition.watch_wander
         self._blocks = max(5, round(WINDOW_S * rig.converter.sample_rate_hz / rig.estimator.block_size))
         self._window_ns = round(1e9 * self._blocks * rig.estimator.block_size / rig.converter.sample_rate_hz)
-        count = len(rig.psds)
-        self._pairs = list(itertools.combinations(range(count), 2))
-        self._readings = [_Channel(name) for name in dot_names(count)]
-        self._lines = [_Channel(f'base line of psd_{a + 1} and psd_{b + 1}') for a, b in self._pairs]
-        self.load: AppliedLoad | None = None
-        self.alarm: Alarm | None = None
-        self.alarms = 0
-        self.windows = 0
-        self.spoilt = 0
+        # All readings learn their levels in the same windows, so the first level stands for all.
+        self._readings = [_Channel(name, self._blocks) for name in dot_names(len(rig.psds))]
+        self._pairs = list(itertools.combinations(range(len(rig.psds)), 2))  # Indices of the PSDs of each base line.
+        base_line_names = [f'base line of psd_{a + 1} and psd_{b + 1}' for a, b in self._pairs]
+        self._base_lines = [_Channel(name, self._blocks) for name in base_line_names]
+        self._channels = (*self._readings, *self._base_lines)
         self._last_index: int | None = None
         self._estimate: DeflectionEstimate | None = None
-        self._reported: TipLoad | None = None
-        self.forget(rig)
+        self._tip_load: TipLoad | None = None
+        self._restart(rig)
 
-    def forget(self, rig: Rig) -> None:
-        """Begin anew with ``rig``: its zero or its parameters have changed."""
-        self._centers, self._beams = rig.centers.tolist(), (rig.centers + rig.zeros).tolist()
-        self._reach = max(math.hypot(x, y) for x, y in self._centers)
-        for channel in (*self._readings, *self._lines):
-            channel.forget()
-            channel.drop()
-        self.alarm = None
-        self._lasting = False
-        self._pending_ns: int | None = None
-        self._count = 0
-        self._off = [0.0, 0.0, 0.0]
-        self._pose = [0.0, 0.0, 0.0]
-        self._reference: tuple[list[float], list[float]] | None = None
-        self._recent: deque[tuple[int, list[float], list[float]]] = deque(maxlen=LEARN + round(CONFIRM_S / WINDOW_S))
-        self._known = False
-        self._line_pose: list[float] | None = None
-        self._quiet = 0
+    def _restart(self, rig: Rig) -> None:
+        """Forget the alarm and all levels, and take the detector centres and zeros from ``rig``."""
+        self._centers, beams = rig.centers.tolist(), (rig.centers + rig.zeros).tolist()
+        self._beam_distances = [
+            math.sqrt((ax - bx) ** 2 + (ay - by) ** 2) for (ax, ay), (bx, by) in itertools.combinations(beams, 2)
+        ]
+        self._reach = max(math.hypot(x, y) for x, y in self._centers)  # Movement of the outermost PSD per twist, m/rad.
+        for channel in self._channels:
+            channel.forget_level()
+        self._discard_window()
+        self.alarm: Alarm | None = None
+        self._alarm_until_restart = False
+        # During an alarm: number of successive windows without a shifted channel.
+        self._good_windows = 0
+        self._pending_ns: int | None = None  # Before an alarm: time since which a channel is shifted.
+        self._base_line_pose: list[float] | None = None  # Pose at which the levels of the base lines became known.
+        self._reference: tuple[list[float], list[float]] | None = None  # Pose and deviation under an earlier load.
+        # Still windows under the known load: those of the last CONFIRM_S and LEVEL_WINDOWS before them.
+        self._recent: deque[_PoseWindow] = deque(maxlen=LEVEL_WINDOWS + round(CONFIRM_S / WINDOW_S))
 
     def put(self, record: Record) -> None:
-        """One record; what it does not need it passes over."""
+        """Process the next record, in the order of the pipeline; types other than the four below are ignored."""
         if isinstance(record, DeflectionEstimate):
             if record.primary:
                 self._estimate = record
         elif isinstance(record, TipLoad):
-            self._reported = record
+            self._tip_load = record
         elif isinstance(record, SpotMeans):
-            self._block(record)
+            self._add_block(record)
         elif isinstance(record, AppliedLoad):
             self.note(record)
 
     def note(self, load: AppliedLoad) -> None:
-        """A known load that acts from now on."""
-        before, self.load = self.load, load
-        if before is not None and before[1:] == load[1:]:
+        """Take ``load`` as the known load; if it differs from the previous load, forget the levels of the readings."""
+        previous, self.load = self.load, load
+        if previous is not None and previous[1:] == load[1:]:
             return
-        for channel in self._readings:
-            channel.forget()
-        # The last moments in which the load was surely not on yet, so that slow drift does not add up.
-        before_ns = load.t_ns - round(1e9 * CONFIRM_S)
-        last = [r for r in self._recent if r[0] <= before_ns][-LEARN:]
-        if self._known and last:
-            self._reference = _level(last)
+        # The earliest time at which the new load may have been applied.
+        earliest_ns = load.t_ns - round(1e9 * CONFIRM_S)
+        windows_before = [window for window in self._recent if window.end_ns <= earliest_ns]
+        if self._readings[0].level is not None and windows_before:
+            self._reference = _median_pose(windows_before[-LEVEL_WINDOWS:])
         self._recent.clear()
-        self._known = False
-        # What was not sure yet was this load. What was sure can no longer be seen to end.
+        for channel in self._readings:
+            channel.forget_level()
+        # The new load explains a pending shift. A present alarm cannot end by recovery: its level is forgotten.
         self._pending_ns = None
-        self._lasting = self.alarm is not None
+        self._alarm_until_restart = self.alarm is not None
 
     def changed(self, change: ParameterChange, rig: Rig) -> None:
-        """Parameters have changed to those of ``rig``; only those that move the readings or the pose matter."""
+        """Restart with ``rig``, the rig after ``change``, if a zero or an effect changed."""
         if any(name in ZEROS or name.startswith(EFFECTS_PREFIX) for name, _ in change.values):
-            self.forget(rig)
+            self._restart(rig)
 
     @property
     def state(self) -> str:
-        """What is watched, in words."""
+        """Return in words which tests are active."""
         if not self.windows:
             return 'no window yet'
         if self.load is None:
@@ -304,133 +318,119 @@ class Watch:
             return 'learns the readings under this load'
         return 'readings, base line and load'
 
-    def _block(self, spots: SpotMeans) -> None:
-        estimate, reported = self._estimate, self._reported
-        sound = spots.status is BlockStatus.OK and not spots.excluded
-        if not sound or estimate is None or estimate.block != spots.index:
-            self._drop()
+    def _add_block(self, spots: SpotMeans) -> None:
+        """Add a block to the current window; a block that is missing, bad or not estimated discards the window."""
+        estimate, tip_load = self._estimate, self._tip_load
+        all_psds_good = spots.status is BlockStatus.OK and not spots.excluded
+        if not all_psds_good or estimate is None or estimate.block != spots.index:
+            self._discard_window()
             return
         if self._last_index not in (None, spots.index - 1):
-            self._drop()
+            self._discard_window()
         self._last_index = spots.index
-        self._add_readings(spots.dots)
-        if self.load is not None and reported is not None and reported.t_ns == estimate.t_ns:
-            loads = zip(self._compliance, reported[1:], self.load[1:], strict=True)
-            self._off = [off + c * (a - b) for off, (c, a, b) in zip(self._off, loads, strict=True)]
-        self._pose = [total + value for total, value in zip(self._pose, estimate.pose, strict=True)]
+        self._add_dots(spots.dots)
+        self._pose_sum = [total + value for total, value in zip(self._pose_sum, estimate.pose, strict=True)]
+        if self.load is not None and tip_load is not None and tip_load.t_ns == estimate.t_ns:
+            # tip_load is the load for which the link model predicts the estimated pose.
+            rows = zip(self._deviation_sum, self._compliance, tip_load[1:], self.load[1:], strict=True)
+            self._deviation_sum = [total + per_load * (needed - known) for total, per_load, needed, known in rows]
         self._count += 1
         if self._count == self._blocks:
-            self._close(spots.t_ns)
+            self._finish_window(spots.t_ns)
 
-    def _add_readings(self, d: tuple[float, ...]) -> None:
-        """Add the dots (2P,), m, of a block, and the excess length of each base line."""
-        c = self._centers
-        for channel, value in zip(self._readings, d, strict=True):
-            channel.add(value)
-        for channel, (a, b) in zip(self._lines, self._pairs, strict=True):
-            x = c[a][0] + d[2 * a] - c[b][0] - d[2 * b]
-            y = c[a][1] + d[2 * a + 1] - c[b][1] - d[2 * b + 1]
-            (ax, ay), (bx, by) = self._beams[a], self._beams[b]
-            channel.add(math.sqrt(x * x + y * y) - math.sqrt((ax - bx) ** 2 + (ay - by) ** 2))
+    def _add_dots(self, dots: tuple[float, ...]) -> None:
+        """Add the dots (2P,) of a block, m, to the channels of the P PSDs."""
+        for reading, value in zip(self._readings, dots, strict=True):
+            reading.add(value)
+        centers = self._centers
+        for base_line, (a, b), beam_distance in zip(self._base_lines, self._pairs, self._beam_distances, strict=True):
+            x = centers[a][0] + dots[2 * a] - centers[b][0] - dots[2 * b]
+            y = centers[a][1] + dots[2 * a + 1] - centers[b][1] - dots[2 * b + 1]
+            base_line.add(math.sqrt(x * x + y * y) - beam_distance)
 
-    def _drop(self) -> None:
-        for channel in (*self._readings, *self._lines):
-            channel.drop()
+    def _discard_window(self) -> None:
+        for channel in self._channels:
+            channel.discard_window()
         self._count = 0
-        self._off, self._pose = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self._pose_sum, self._deviation_sum = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
 
-    def _close(self, t_ns: int) -> None:
-        """A window is complete; ``t_ns``: of its last block."""
-        n = self._count
-        pose = [v / n for v in self._pose]
-        off = [v / n for v in self._off]
-        self._count, self._off, self._pose = 0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-        began_ns = t_ns - self._window_ns
+    def _finish_window(self, end_ns: int) -> None:
+        """Test the current window, whose last block has the time ``end_ns``, and start a new window."""
+        pose = [total / self._blocks for total in self._pose_sum]
+        deviation = [total / self._blocks for total in self._deviation_sum]
+        window = _PoseWindow(end_ns - self._window_ns, end_ns, pose, deviation)
+        for channel in self._channels:
+            channel.finish_window()
+        self._discard_window()
+        readings_still = all(reading.still for reading in self._readings)
         self.windows += 1
-        lines = [channel.close() for channel in self._lines]
-        readings = [channel.close() for channel in self._readings]
-        # Each is asked, so that each remembers its own scatter.
-        still = all([channel.still(w) for channel, w in zip(self._readings, readings, strict=True)])
-        steady = all([channel.still(w) for channel, w in zip(self._lines, lines, strict=True)])
-        held = self.load is None or self.load.t_ns <= began_ns
-        self.spoilt += not still
-        if steady:
-            self._base_lines(lines, pose, began_ns, n)
-        if still and held and self.load is not None:
-            self._held_readings(readings, pose, off, began_ns, n)
-        self._evaluate(t_ns)
+        self.spoilt += not readings_still
+        if all(base_line.still for base_line in self._base_lines):
+            self._test_base_lines(window)
+        if readings_still and self.load is not None and self.load.t_ns <= window.start_ns:
+            self._test_readings(window)
+        self._update_alarm(end_ns)
 
-    def _base_lines(self, windows: Sequence[_Window], pose: list[float], began_ns: int, blocks: int) -> None:
-        for channel, window in zip(self._lines, windows, strict=True):
-            if channel.level is None:
-                if channel.learn(window.mean):
-                    self._line_pose = pose
-                continue
-            moved = 0.0
-            if self._line_pose is not None:
-                moved = math.dist(pose[:2], self._line_pose[:2]) + self._reach * abs(pose[2] - self._line_pose[2])
-            channel.count(window.mean, began_ns, blocks, self._allowed_drift + RELATIVE * moved)
+    def _test_base_lines(self, window: _PoseWindow) -> None:
+        """Update the base lines, with a tolerance that grows with the movement since their levels became known."""
+        pose, learned_pose = window.pose, self._base_line_pose
+        moved = 0.0
+        if learned_pose is not None:
+            moved = math.dist(pose[:2], learned_pose[:2]) + self._reach * abs(pose[2] - learned_pose[2])
+        tolerance = self._drift_tolerance + BASE_LINE_FRACTION * moved
+        for base_line in self._base_lines:
+            if base_line.update(window.start_ns, tolerance):
+                self._base_line_pose = pose
 
-    def _held_readings(
-        self, windows: Sequence[_Window], pose: list[float], off: list[float], began_ns: int, blocks: int
-    ) -> None:
-        learned = False
-        for channel, window in zip(self._readings, windows, strict=True):
-            if channel.level is None:
-                learned = channel.learn(window.mean)
-            else:
-                channel.count(window.mean, began_ns, blocks, self._allowed_drift)
-        self._recent.append((began_ns + self._window_ns, pose, off))
-        if learned:
-            self._known = True
-            self._new_load(began_ns)
+    def _test_readings(self, window: _PoseWindow) -> None:
+        """Update the readings; in the window that completes their levels, test the load."""
+        learned = [reading.update(window.start_ns, self._drift_tolerance) for reading in self._readings]
+        self._recent.append(window)
+        if all(learned):
+            self._test_load(window.end_ns)
 
-    def _new_load(self, began_ns: int) -> None:
-        """The level under a load is known: has the pose moved from the load before as the link model says?"""
-        if self._reference is None:
+    def _test_load(self, end_ns: int) -> None:
+        """Raise an alarm if the pose has not moved from the reference pose as the link model predicts."""
+        if self._reference is None or self.load is None or self.alarm is not None:
             return
-        (pose, off), (pose0, off0) = _level(self._recent), self._reference
-        moved = math.dist(pose[:2], pose0[:2])
-        worst: tuple[float, str, float, float] = (1.0, '', 0.0, 0.0)
-        for i, name in enumerate(('dx', 'dy', 'theta')):
-            shift = off[i] - off0[i]
-            allowed = OFF + SHARE * moved if i < 2 else OFF_TWIST + SHARE * abs(pose[2] - pose0[2])
-            if abs(shift) > allowed * worst[0]:
-                worst = (abs(shift) / allowed, name, shift, allowed / 6.0)
-        if worst[1] and self.alarm is None and self.load is not None:
-            self._raise(Alarm(self.load.t_ns, began_ns + self._window_ns, worst[1], worst[2], worst[3]))
-            self._lasting = True
+        (pose, deviation), (old_pose, old_deviation) = _median_pose(self._recent), self._reference
+        moved, rotated = math.dist(pose[:2], old_pose[:2]), abs(pose[2] - old_pose[2])
+        worst: Alarm | None = None
+        worst_ratio = 1.0
+        rows = zip(POSE_TOLERANCES.items(), (moved, moved, rotated), deviation, old_deviation, strict=True)
+        for (axis, constant), movement, new, old in rows:
+            shift, tolerance = new - old, constant + POSE_FRACTION * movement
+            if abs(shift) > tolerance * worst_ratio:
+                worst_ratio = abs(shift) / tolerance
+                worst = Alarm(self.load.t_ns, end_ns, axis, shift, tolerance / TOLERANCE_SIGMAS)
+        if worst is not None:
+            self._raise(worst)
+            self._alarm_until_restart = True
 
-    def _evaluate(self, t_ns: int) -> None:
-        beyond = [c for c in (*self._readings, *self._lines) if c.beyond]
+    def _update_alarm(self, end_ns: int) -> None:
+        """Raise an alarm for shifted channels, or end the present alarm if its channels have recovered."""
+        shifted = [channel for channel in self._channels if channel.shifted]
         if self.alarm is not None:
-            # It lasts until the readings are back for a while under the same load, or until the zero is taken.
-            self._quiet = 0 if beyond else self._quiet + 1
-            if self._quiet >= BACK and not self._lasting:
+            self._good_windows = 0 if shifted else self._good_windows + 1
+            if self._good_windows >= RECOVERY_WINDOWS and not self._alarm_until_restart:
                 self.alarm = None
-        elif not beyond:
+        elif not shifted:
             self._pending_ns = None
         else:
-            self._pending_ns = t_ns if self._pending_ns is None else self._pending_ns
-            if t_ns - self._pending_ns >= 1e9 * CONFIRM_S or self.load is None:
-                self._confirm(t_ns, beyond)
-
-    def _confirm(self, t_ns: int, beyond: list[_Channel]) -> None:
-        """Raise the alarm of the channel that is shifted most."""
-        shifts = {c.name: c.shift() for c in beyond}
-        first = max(beyond, key=lambda c: abs(shifts[c.name][0]))
-        also = tuple(c.name for c in beyond if c is not first)
-        self._raise(Alarm(min(c.since_ns for c in beyond), t_ns, first.name, *shifts[first.name], also))
+            self._pending_ns = end_ns if self._pending_ns is None else self._pending_ns
+            if end_ns - self._pending_ns >= 1e9 * CONFIRM_S or self.load is None:
+                largest = max(shifted, key=lambda channel: abs(channel.shift()[0]))
+                also = tuple(channel.name for channel in shifted if channel is not largest)
+                since_ns = min(channel.since_ns for channel in shifted)
+                self._raise(Alarm(since_ns, end_ns, largest.name, *largest.shift(), also))
 
     def _raise(self, alarm: Alarm) -> None:
         self.alarm = alarm
         self.alarms += 1
-        self._quiet = 0
-        self._pending_ns = None
+        self._good_windows, self._pending_ns = 0, None
 
 
-def _level(windows: Collection[tuple[int, list[float], list[float]]]) -> tuple[list[float], list[float]]:
-    """Pose (3,) and how far it is off the link model (3,) in some windows: medians."""
-    _, poses, offs = zip(*windows, strict=True)
-    pose = [statistics.median(c) for c in zip(*poses, strict=True)]
-    return pose, [statistics.median(c) for c in zip(*offs, strict=True)]
+def _median_pose(windows: Collection[_PoseWindow]) -> tuple[list[float], list[float]]:
+    """Return the medians of pose and deviation, each (3,), over the windows."""
+    pose = [statistics.median(values) for values in zip(*(w.pose for w in windows), strict=True)]
+    return pose, [statistics.median(values) for values in zip(*(w.deviation for w in windows), strict=True)]
