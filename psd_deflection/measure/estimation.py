@@ -393,7 +393,7 @@ class Estimation:
         )
 
     def _covariance(self, answer: SolverAnswer, solved: SolvedReadings) -> FloatArray | None:
-        """Return the pose covariance (3, 3) by noise, calibration and inconsistency; None if the answer has no noise."""
+        """Return the pose covariance (3, 3) by noise, calibration and inconsistency; None if no noise is known."""
         if answer.gain is None or answer.noise is None:
             return None
         covariance, check_result = answer.noise, solved.check_result

@@ -116,13 +116,13 @@ def alarm_sentences(alarms: Sequence[Alarm], start_ns: int, watched: str) -> lis
 class _PoseWindow(NamedTuple):
     """Start and end of a window, and its means of ``pose`` and ``deviation``, each (3,): dx m, dy m, theta rad.
 
-    ``deviation``: estimated pose minus the pose that the link model predicts for the annotated load.
+    ``deviation``: estimated pose minus the pose that the link model predicts for the annotated load; None if unknown.
     """
 
     start_ns: int
     end_ns: int
     pose: list[float]
-    deviation: list[float]
+    deviation: list[float] | None
 
 
 class _Channel:
@@ -334,6 +334,7 @@ class Watch:
             # tip_load is the load for which the link model predicts the estimated pose.
             rows = zip(self._deviation_sum, self._compliance, tip_load[1:], self.load[1:], strict=True)
             self._deviation_sum = [total + per_load * (needed - known) for total, per_load, needed, known in rows]
+            self._tip_loads += 1
         self._count += 1
         if self._count == self._blocks:
             self._finish_window(spots.t_ns)
@@ -352,12 +353,15 @@ class Watch:
         for channel in self._channels:
             channel.discard_window()
         self._count = 0
-        self._pose_sum, self._deviation_sum = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self._pose_sum: list[float] = [0.0, 0.0, 0.0]
+        self._deviation_sum: list[float] = [0.0, 0.0, 0.0]
+        self._tip_loads: int = 0
 
     def _finish_window(self, end_ns: int) -> None:
         """Test the current window, whose last block has the time ``end_ns``, and start a new window."""
         pose = [total / self._blocks for total in self._pose_sum]
-        deviation = [total / self._blocks for total in self._deviation_sum]
+        # One tip load in ``decimation`` blocks.
+        deviation = [total / self._tip_loads for total in self._deviation_sum] if self._tip_loads else None
         window = _PoseWindow(end_ns - self._window_ns, end_ns, pose, deviation)
         for channel in self._channels:
             channel.finish_window()
@@ -385,13 +389,14 @@ class Watch:
     def _test_readings(self, window: _PoseWindow) -> None:
         """Update the readings; in the window that completes their levels, test the load."""
         learned = [reading.update(window.start_ns, self._drift_tolerance) for reading in self._readings]
-        self._recent.append(window)
+        if window.deviation is not None:
+            self._recent.append(window)
         if all(learned):
             self._test_load(window.end_ns)
 
     def _test_load(self, end_ns: int) -> None:
         """Raise an alarm if the pose has not moved from the reference pose as the link model predicts."""
-        if self._reference is None or self.load is None or self.alarm is not None:
+        if self._reference is None or self.load is None or self.alarm is not None or not self._recent:
             return
         (pose, deviation), (old_pose, old_deviation) = _median_pose(self._recent), self._reference
         moved, rotated = math.dist(pose[:2], old_pose[:2]), abs(pose[2] - old_pose[2])
@@ -431,6 +436,8 @@ class Watch:
 
 
 def _median_pose(windows: Collection[_PoseWindow]) -> tuple[list[float], list[float]]:
-    """Return the medians of pose and deviation, each (3,), over the windows."""
+    """Return the medians of pose and deviation, each (3,), over windows with a deviation."""
     pose = [statistics.median(values) for values in zip(*(w.pose for w in windows), strict=True)]
-    return pose, [statistics.median(values) for values in zip(*(w.deviation for w in windows), strict=True)]
+    return pose, [
+        statistics.median(values) for values in zip(*(w.deviation for w in windows if w.deviation), strict=True)
+    ]

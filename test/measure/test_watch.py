@@ -26,7 +26,8 @@ SECOND = 50
 class Fed:
     """A watch of ``rig`` that is fed block means with this noise, m."""
 
-    def __init__(self, rig: Rig = RIG, noise: float = NOISE) -> None:
+    def __init__(self, rig: Rig = RIG, noise: float = NOISE, decimation: int = 1) -> None:
+        self._decimation = decimation
         self.watch = Watch(rig, COMPLIANCE)
         self.block = 0
         self._noise = noise
@@ -57,7 +58,7 @@ class Fed:
             dx, dy, theta = pose
             for record in (
                 records.DeflectionEstimate(t_ns, self.block, 'exact', dx, dy, theta, 0.0, 0.0, (0.0,) * 9, 0.0, True),
-                records.TipLoad(t_ns, *loads),
+                records.TipLoad(t_ns if self.block % self._decimation == 0 else -1, *loads),
                 records.SpotMeans(
                     *(t_ns, self.block, tuple(four), (5.0,) * (many // 2), np.zeros((many, many)), 20, 0, status, '')
                 ),
@@ -263,9 +264,9 @@ def test_without_a_known_load_only_the_base_line_is_watched() -> None:
     assert fed.watch.alarm.channel == 'base line of psd_1 and psd_2'
 
 
-@pytest.mark.parametrize(('share', 'alarm'), [(1.01, False), (1.06, True)])
-def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool) -> None:
-    fed = Fed()
+@pytest.mark.parametrize(('share', 'alarm', 'decimation'), [(1.01, False, 1), (1.06, True, 1), (1.06, True, 7)])
+def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool, decimation: int) -> None:
+    fed = Fed(decimation=decimation)
     fed.load(0.0, 0.0)
     fed.run(6.0, under(0.0, 0.0))
     # Noted less than three seconds before the next: its pose is not yet sure, so the one before it counts.
