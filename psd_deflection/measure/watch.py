@@ -251,6 +251,8 @@ class Watch:
         self._last_index: int | None = None
         self._estimate: DeflectionEstimate | None = None
         self._tip_load: TipLoad | None = None
+        self._pose_sum: list[float] = []
+        self._deviation_sum: list[float] = []
         self._restart(rig)
 
     def _restart(self, rig: Rig) -> None:
@@ -353,9 +355,8 @@ class Watch:
         for channel in self._channels:
             channel.discard_window()
         self._count = 0
-        self._pose_sum: list[float] = [0.0, 0.0, 0.0]
-        self._deviation_sum: list[float] = [0.0, 0.0, 0.0]
-        self._tip_loads: int = 0
+        self._pose_sum, self._deviation_sum = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+        self._tip_loads = 0
 
     def _finish_window(self, end_ns: int) -> None:
         """Test the current window, whose last block has the time ``end_ns``, and start a new window."""
