@@ -32,7 +32,7 @@ unexport PYTHONDONTWRITEBYTECODE
 export OMP_NUM_THREADS ?= 1
 # uv installs the same packages with a tenth of the work. It is used if it is there; `make UV= run` takes pip all the same.
 UV ?= $(shell command -v uv)
-INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python -m pip install --disable-pip-version-check) --quiet
+INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python -m pip install --disable-pip-version-check --use-pep517) --quiet
 # A half-made environment is no environment: what has no pip is made anew, and what could not be made goes.
 HALF_MADE = $(if $(wildcard $(VENV)/pyvenv.cfg),--clear)
 MAKE_VENV = $(PYTHON) -m venv $(HALF_MADE) $(VENV) || { test ! -f $(VENV)/pyvenv.cfg || rm -rf $(VENV); exit 1; }

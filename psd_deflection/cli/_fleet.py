@@ -15,7 +15,7 @@ from tqdm import tqdm
 from psd_deflection.base.errors import SomeFailedError, UsageError
 from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import make_folder, make_writable
-from psd_deflection.cli._report import print_json, save_all, show, show_text, warn
+from psd_deflection.cli._report import print_json, save, show, show_text, warn
 from psd_deflection.recordings.write.parquet import ENDING, ERROR, Field, ParquetFile, is_parquet
 from psd_deflection.run.fleet.tasks import FORMS, SERIAL, Outcome, check_engine, is_plain, listed, open_engine, outcomes
 
@@ -139,7 +139,9 @@ def answer_each(
                 warn(f'{_short(name)}: {warning}')
             rows[name] = answer.cells
             if out is None:
-                save_all(answer.files, make_folder(str(folders[name])))
+                folder = make_folder(str(folders[name]))
+                for file, text in answer.files.items():
+                    save(text.encode(errors='replace'), folder / file)
 
         failed = run_each(args, names, work, take)
         if out is not None:

@@ -6,6 +6,7 @@ import io
 import shutil
 import sys
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,11 @@ def save(content: bytes, path: Path) -> None:
 
 
 def save_all(files: Mapping[str, str], folder: Path) -> None:
-    """Write texts by their names; raises RecordingError as :func:`save` does."""
+    """Write texts by their names, with a note if earlier ones are replaced; raises RecordingError as :func:`save`."""
+    earlier = [(folder / name).stat().st_mtime for name in files if (folder / name).exists()]
+    if earlier:
+        made = datetime.fromtimestamp(max(earlier)).astimezone()
+        warn(Note(f'--out {folder}: replaces the results of {made:%Y-%m-%d %H:%M:%S}'))
     for name, text in files.items():
         save(text.encode(errors='replace'), folder / name)
 

@@ -74,8 +74,11 @@ def test_a_command_of_another_package_runs(capsys: pytest.CaptureFixture[str]) -
 def test_a_study_of_another_package_answers_and_writes_its_page(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert main(['length', str(BAGS / 'clean'), '--out', str(tmp_path / 'out')]) == 0
-    assert ' s of samples.' in capsys.readouterr().out
+    for earlier in (False, True):
+        assert main(['length', str(BAGS / 'clean'), '--out', str(tmp_path / 'out')]) == 0
+        printed = capsys.readouterr()
+        assert ' s of samples.' in printed.out
+        assert (f'note: --out {tmp_path / "out"}: replaces the results of 20' in printed.err) is earlier
     assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['length.json', 'report.html']
 
 
