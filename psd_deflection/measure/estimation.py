@@ -7,7 +7,7 @@ A dot is where a beam meets a position sensing detector (PSD): two readings, x a
 is (dX, dY, theta) in m, m, rad; theta is called twist. The zero is the dots of the unloaded link.
 
 The PSDs without a fault are solved together. If their readings contradict each other and the consistency check blames
-one PSD, that PSD is excluded. If only one PSD is left, only the translation is estimated.
+one PSD, that PSD is excluded. If only one PSD is left, the translation is estimated, if ``degraded`` asks for it.
 """
 
 import itertools
@@ -50,7 +50,7 @@ class BlockInput:
     the block, from 0. ``samples`` (n, 2P): dots, m; ``means`` (2P,): their means. ``mean_sums`` (P,): mean sum signals
     (total light), V. ``frozen`` (P,): for each PSD, in how many successive blocks, up to this one, its values did not
     change. ``fully_published``: whether the parameter ``decimation`` selects this block; otherwise the dots, the tip
-    load and the other solvers' estimates are not published, and the primary estimate not on its solver's own topic.
+    load and the other solvers' estimates are not published; the primary one is, but not on its solver's own topic.
     """
 
     t_ns: int
@@ -134,6 +134,7 @@ class Estimation:
         self.systematic: FloatArray | None = None
         self.build(rig, effects)
         # After build(), whose solvers reject a geometry that cannot be solved.
+        # PSDs on the plate: their noise is measured, and their readings are checked. At the base: neither.
         self.estimator = BlockEstimator(rig, on_plate=not rig.psds_at_base, tilts=solver_class(config.solver).tilts)
 
     def build(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
@@ -184,7 +185,9 @@ class Estimation:
         return self.primary.gain(zero_dots, variances, self.primary.solve(zero_dots, variances))
 
     def vibration(self, tones: Sequence[Tone]) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances (3, 3) of pose and pose rate, SI units, from ``tones``."""
+        """Return the covariances (3, 3) of pose and pose rate, SI units, of ``tones``, sinusoidal vibrations.
+
+        Their frequencies are in cycles per sample."""
         gain = self.gain_at_rest()
         pose_covariance, rate_covariance = np.zeros((3, 3)), np.zeros((3, 3))
         for tone in tones:
@@ -201,12 +204,12 @@ class Estimation:
     def fit(self, blocks: Sequence[BlockInput]) -> list[BlockReadings | None]:
         """Return for each block all readings, fitted at its timestamp; None if its verdict is not OK.
 
-        No state changes: :meth:`solve` takes the fit's memory of motion over, block by block.
+        Changes no state: :meth:`solve` stores, for each block, what the fit remembers of the motion.
         """
         fit, readings = self.estimator.full.fit, list[BlockReadings | None]()
         memory = fit.memory
         # Blocks with samples in the same slots are fitted together, which saves time and changes no result.
-        for (ok, _), group in itertools.groupby(blocks, key=_fitted_alike):
+        for (ok, _), group in itertools.groupby(blocks, key=_fit_group):
             alike = list(group)
             if not ok:
                 readings += [None] * len(alike)
@@ -224,16 +227,16 @@ class Estimation:
         ``readings``: those of :meth:`fit`.
         """
         verdict = block.verdict
-        variances = self._variances_with_light(block, self.variances[len(block.slots) - 1])
+        variances = self._variances_with_light_errors(block, self.variances[len(block.slots) - 1])
         if readings is not None:
             self.estimator.full.fit.memory = readings.fitted.memory
             if verdict.findings:
-                # The fit does not contain the light errors.
+                # A finding warns of half or foreign light, say; the fit's covariance lacks the errors of such light.
                 readings = self._block_readings(readings.psds, readings.fitted, block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
             # A block with a faulty PSD uses the measured noise instead of that of the rig file.
-            variances = self._variances_with_light(block, self.estimator.mean_variances(len(block.slots)))
+            variances = self._variances_with_light_errors(block, self.estimator.mean_variances(len(block.slots)))
         subset = self._fit_psds(verdict.sound, block, variances) if len(verdict.sound) > 1 else None
         if subset is not None:
             return self._solve_consistent(block, block.means, variances, subset)
@@ -307,7 +310,7 @@ class Estimation:
         return self._solve_primary(readings)._replace(excluded_psd=psd_set.psds[place - 1] + 1)
 
     def _is_consistent(self, solved: SolvedReadings | None) -> bool:
-        """Return whether the readings can be checked and are consistent without the uncertainty of the calibration."""
+        """Return whether the readings can be checked and are consistent, with noise as the only error."""
         if solved is None or solved.solution is None:
             return False
         readings, unexplained = solved.readings, solved.unexplained
@@ -359,7 +362,7 @@ class Estimation:
         ``variances`` (2P,), m^2: noise of the readings of all PSDs, for the weights of the solvers.
         """
         set_variances = tuple([variances[i] for i in psd_set.columns])
-        covariance = self._covariance_with_light(block, fitted.covariance, psd_set.columns)
+        covariance = self._covariance_with_light_errors(block, fitted.covariance, psd_set.columns)
         run = ReadingsRun(self._solvers, psd_set, [fitted.dots], set_variances, covariance[None])
         return BlockReadings(run, 0, fitted)
 
@@ -412,14 +415,16 @@ class Estimation:
         factor = 4.0 if block.verdict.half_light else 1.0
         return factor, np.repeat(self._optics.background_variance(block.mean_sums), 2)
 
-    def _covariance_with_light(self, block: BlockInput, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
+    def _covariance_with_light_errors(
+        self, block: BlockInput, covariance: FloatArray, columns: Sequence[int]
+    ) -> FloatArray:
         """Return the ``covariance`` (C, C), m^2, of the readings ``columns``, increased by :meth:`_light_errors`."""
         if not block.verdict.findings:
             return covariance
         factor, background = self._light_errors(block)
         return factor * covariance + np.diag(background[list(columns)])
 
-    def _variances_with_light(self, block: BlockInput, variances: tuple[float, ...]) -> tuple[float, ...]:
+    def _variances_with_light_errors(self, block: BlockInput, variances: tuple[float, ...]) -> tuple[float, ...]:
         """Return the noise ``variances`` (2P,), m^2, of the mean readings, increased by :meth:`_light_errors`."""
         if not block.verdict.findings:
             return variances
@@ -448,8 +453,8 @@ class Estimation:
         if self.parameter_covariance is not None:
             # translation = l - R(theta) (c + dot), l: beam, c: centre of the PSD; d(translation)/d(dot) = -R(theta).
             gain = np.zeros((3, 2 * len(self._rig.psds)))
-            c, s = xp.cos_sin(theta)
-            gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
+            cos, sin = xp.cos_sin(theta)
+            gain[:2, 2 * psd : 2 * psd + 2] = [[-cos, sin], [-sin, -cos]]
             added = _pose_covariance(gain, self.parameter_covariance.factor(dx, dy, theta), xp)
             covariance = tuple((np.array(covariance).reshape(3, 3) + added).ravel().tolist())
         labels, pose_and_tilts = (block.t_ns, block.index, ONE_PSD), (dx, dy, theta, 0.0, 0.0)
@@ -458,8 +463,8 @@ class Estimation:
         )
 
 
-def _fitted_alike(block: BlockInput) -> tuple[bool, bytes]:
-    """Return whether a block is fitted, and which slots have samples."""
+def _fit_group(block: BlockInput) -> tuple[bool, bytes]:
+    """Return the key of blocks that are fitted together: whether the verdict is OK, and which slots have samples."""
     return block.verdict.status is BlockStatus.OK, block.slots.tobytes()
 
 

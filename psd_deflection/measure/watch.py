@@ -3,7 +3,7 @@
 """Detects from the records of a run when the rig no longer matches its model (terms: ``docs/glossary.md``).
 
 A reading is one coordinate of a dot (x1, y1, x2, y2 ..., m). A window is half a second of consecutive blocks, each with
-an estimate from all PSDs. Windows during motion are skipped. Three tests compare the means of the other windows:
+an estimate from all PSDs. Three tests compare means over windows, the first and the third only while the tip rests:
 
 * **Readings**: while a known load acts, each reading must keep the level of its first windows under this load.
 * **Base line**: the distance between the dots of two PSDs, minus the distance between their beams, must keep its level.
@@ -70,7 +70,7 @@ POSE_TOLERANCES = {'dx': 5e-6, 'dy': 5e-6, 'theta': 40e-6}
 POSE_FRACTION = 0.02
 """Permitted further error of the link model, as a fraction of the movement from one load to the next."""
 TOLERANCE_SIGMAS = 6.0
-"""Ratio of tolerance to standard deviation in an alarm of the load test, which measures no standard deviation."""
+"""The load test measures no standard deviation; its alarms report the tolerance divided by this number as ``sd``."""
 RECOVERY_WINDOWS = 20
 """Number of successive windows without a shifted channel after which an alarm ends: ten seconds."""
 
@@ -103,14 +103,14 @@ class Alarm:
         also = f'; {", ".join(self.also)} too' if self.also else ''
         return (
             f'{self.channel} is {1e6 * self.shift:+.2f} {unit} off ({self.sigmas:.0f} standard deviations){also}: '
-            'the rig is no longer its model, or a load acts that was not noted'
+            'the rig no longer matches its model, or a load acts that was not noted'
         )
 
 
 def alarm_sentences(alarms: Sequence[Alarm], start_ns: int, watched: str) -> list[str]:
     """Return a sentence per alarm, timed in s from ``start_ns``; without alarms, one that names what is ``watched``."""
     lines = [f'since {(alarm.since_ns - start_ns) / 1e9:.1f} s: {alarm.words}' for alarm in alarms]
-    return lines or [f'the rig is its model; watched: {watched}']
+    return lines or [f'the rig matches its model; watched: {watched}']
 
 
 class _PoseWindow(NamedTuple):
@@ -242,7 +242,7 @@ class Watch:
         self._drift_tolerance = rig.acquisition.watch_wander
         self._blocks = max(5, round(WINDOW_S * rig.converter.sample_rate_hz / rig.estimator.block_size))
         self._window_ns = round(1e9 * self._blocks * rig.estimator.block_size / rig.converter.sample_rate_hz)
-        # All readings learn their levels in the same windows, so the first level stands for all.
+        # All readings learn their levels in the same windows: if the first has a level, all have one.
         self._readings = [_Channel(name, self._blocks) for name in dot_names(len(rig.psds))]
         self._pairs = list(itertools.combinations(range(len(rig.psds)), 2))  # Indices of the PSDs of each base line.
         base_line_names = [f'base line of psd_{a + 1} and psd_{b + 1}' for a, b in self._pairs]
@@ -272,7 +272,7 @@ class Watch:
         self._pending_ns: int | None = None  # Before an alarm: time since which a channel is shifted.
         self._base_line_pose: list[float] | None = None  # Pose at which the levels of the base lines became known.
         self._reference: tuple[list[float], list[float]] | None = None  # Pose and deviation under an earlier load.
-        # Still windows under the known load: those of the last CONFIRM_S and LEVEL_WINDOWS before them.
+        # Windows without motion under the known load: those of the last CONFIRM_S, and LEVEL_WINDOWS before them.
         self._recent: deque[_PoseWindow] = deque(maxlen=LEVEL_WINDOWS + round(CONFIRM_S / WINDOW_S))
 
     def put(self, record: Record) -> None:
@@ -300,7 +300,7 @@ class Watch:
         self._recent.clear()
         for channel in self._readings:
             channel.forget_level()
-        # The new load explains a pending shift. A present alarm cannot end by recovery: its level is forgotten.
+        # The new load explains a pending shift. A present alarm cannot end by recovery: readings have no level now.
         self._pending_ns = None
         self._alarm_until_restart = self.alarm is not None
 
@@ -361,7 +361,7 @@ class Watch:
     def _finish_window(self, end_ns: int) -> None:
         """Test the current window, whose last block has the time ``end_ns``, and start a new window."""
         pose = [total / self._blocks for total in self._pose_sum]
-        # One tip load in ``decimation`` blocks.
+        # Only every ``decimation``-th block has a tip load: the mean is over those.
         deviation = [total / self._tip_loads for total in self._deviation_sum] if self._tip_loads else None
         window = _PoseWindow(end_ns - self._window_ns, end_ns, pose, deviation)
         for channel in self._channels:

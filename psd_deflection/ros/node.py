@@ -66,8 +66,8 @@ def rcl_log_file() -> Path | None:
 class NodeLog:
     """The log callback of a node. A call logs one line on the terminal (by ``log``), on ``/rosout`` and in rcl's file.
 
-    rcl does not log these lines, because rcl would also print them on the terminal, across the status line that the
-    display redraws there. A thread writes the file, so that a hanging disk delays nothing.
+    The lines do not pass rcl's logger, which would also print them on the terminal, across the status line that the
+    display redraws there. A thread appends them to rcl's file, so that a hanging disk delays nothing.
     """
 
     def __init__(self, node: Node, log: LogCallback) -> None:
@@ -179,7 +179,7 @@ class BaseNode(abc.ABC, Generic[T]):
         self.finished = self.active = False
         self._starting = False  # True during an automatic start, whose errors are raised, not logged.
         self._last_contested: frozenset[str] = frozenset()  # `contested_topics` at the last check.
-        self._exclusive: list[Publisher] = []  # Bound: the topics of the node.
+        self._exclusive: list[Publisher] = []  # Bound: one per topic of the node.
         self._diagnostics: Publisher | None = None
         self.node = _make_node(name, overrides)
         self.node.owner = self
@@ -258,7 +258,7 @@ class BaseNode(abc.ABC, Generic[T]):
 
     def publisher(self, topic: str) -> Publisher:
         """Return a new publisher of ``topic``, a key of :data:`PUBLISHED`. The topic is exclusive to this node, unless
-        all nodes publish it (``/diagnostics``)."""
+        several may publish it (``/diagnostics``, ``/tf``)."""
         publisher = publisher_of(self.node, topic)
         if not PUBLISHED[topic].common:
             self._exclusive.append(publisher)
@@ -296,7 +296,7 @@ class BaseNode(abc.ABC, Generic[T]):
         self._starting = False
 
     def release(self) -> None:
-        """Carry out the lifecycle's transition ``cleanup``, after which the node is unconfigured."""
+        """Carry out the transition ``cleanup``: the node is unconfigured. Each transition may call :meth:`cleanup`."""
         self.cleanup()
 
     def finish(self) -> None:
@@ -352,7 +352,7 @@ class BaseNode(abc.ABC, Generic[T]):
         # A node in a namespace probably runs beside others of its kind, whose frames would have the same names.
         names_frames = FRAME_PREFIX in self.parameters.values
         if names_frames and not self.frame_prefix and self.node.get_namespace() != '/':
-            self.log('frames have no prefix: where several run, give each its own (frame_prefix)', WARNING)
+            self.log('frames have no prefix: if several nodes run, give each its own (frame_prefix)', WARNING)
 
     def _reject_sim_time(self) -> None:
         """Unset ``use_sim_time``, and from now on reject requests to set it."""
@@ -430,7 +430,7 @@ def serve(
     should_run: Callable[[], bool] = lambda: True,
     on_start: Callable[[], None] = lambda: None,
 ) -> None:
-    """Start ``owner`` and run its callbacks until a signal, ``change_state`` or a false ``should_run()`` ends the loop.
+    """Start ``owner`` and run its callbacks until a signal, the transition ``shutdown`` or a false ``should_run()``.
 
     ``should_run``: called after each callback, and every ``SPIN_S`` without one. ``on_start``: called once. After a
     signal the node has ``REST_LIMIT_S`` to come to rest; a second signal ends the wait. Raises what ``start`` raises.

@@ -112,7 +112,7 @@ class HealthReporter:
         counters = s.acquisition.counters
         level, message = OK, 'samples flow'
         if s.simulated:
-            level, message = WARN, 'samples of the simulated rig flow: no port is given'
+            level, message = WARN, 'no port is given: these samples are simulated'
         if new.samples == 0:
             level, message = ERROR, 'no samples'
         elif new.lost or new.bad or new.dropped:

@@ -23,8 +23,8 @@ from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.realtime import SLOW, lag_reason
 
 QUEUED_PER_BLOCK = 100
-"""Limit of the queue: messages for each block of ``queue_blocks``. A block (the samples of one estimate) makes about
-ten messages every 20 ms, so the default queue (25,000 messages, 25 MB) outlasts a disk that hangs for 50 s."""
+"""The queue holds at most ``queue_blocks`` times this many messages. One block (the samples of one estimate, every
+20 ms) makes about ten, so the default queue (250 blocks: 25,000 messages, 25 MB) outlasts a disk that hangs 50 s."""
 MOST_THREADS = 8
 """Limit of recorder threads: a further start is rejected. A stopped recording has a thread until its bag is closed."""
 QUEUE_BYTES = 100_000_000
@@ -45,7 +45,7 @@ RECORD_ELSEWHERE = 'record elsewhere (parameter bag_dir)'
 QueuedMessage = tuple[str, str, bytes, int]  # Topic, type name, message encoded as CDR, log time in ns.
 QueueItem = QueuedMessage | ParameterChange | None  # None ends the recording.
 StateGetter = Callable[[Rig], ParameterChange | None]
-"""``Pipeline.memory``: returns the state that the next block depends on besides its samples and the rig, or None."""
+"""``Pipeline.memory``: returns what the pipeline carries over from earlier blocks, as a change; None if nothing."""
 
 
 def new_folder(parent: Path, stem: str = 'psd') -> Path:
@@ -284,7 +284,7 @@ class Recorder:
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
         """Return a new bag in ``bag_dir``. Raises RecordingError if the disk is nearly full or rejects the bag."""
         config = rig.acquisition
-        # Only complete files older than bag_keep are deleted: without bag_max_duration, a file spans a seventh of it.
+        # bag_keep deletes complete files, so files must end: without bag_max_duration after a seventh of bag_keep.
         file_s = config.bag_max_duration or config.bag_keep / 7.0
         with self._folder_lock:
             folder = new_folder(Path(config.bag_dir).expanduser())
@@ -405,7 +405,7 @@ class Recorder:
 
 def _wait_for_writer(job: RecordingJob, thread: threading.Thread, deadline_s: float) -> None:
     """Wait until ``thread`` ends, the queue of ``job`` stops shrinking, or ``deadline_s`` (monotonic time) passes."""
-    # With the 1 added, the first wait counts as progress: the thread may be closing the bag.
+    # One more, so that an empty queue does not end the waiting after the first join: the thread may close the bag.
     remaining = job.queue.qsize() + 1
     while thread.is_alive() and time.monotonic() < deadline_s:
         before = remaining

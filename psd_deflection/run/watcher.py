@@ -184,7 +184,7 @@ class Watcher:
             return DiagnosticEntry(NAME, WARN, f'since {_clock(alarm.since_ns)}: {alarm.words}', tuple(values))
         if self.failure:
             return DiagnosticEntry(NAME, WARN, self.failure, tuple(values))
-        return DiagnosticEntry(NAME, OK, f'the rig is its model; watched: {watch.state}', tuple(values))
+        return DiagnosticEntry(NAME, OK, f'the rig matches its model; watched: {watch.state}', tuple(values))
 
     def _keep(self) -> None:
         self._due_ns = None

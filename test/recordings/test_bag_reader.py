@@ -346,7 +346,7 @@ def information(folder: Path, **changes: object) -> Path:
         ({'compression_mode': 'FILE'}, 'compressed by rosbag2'),
         ({'relative_file_paths': []}, 'names no file'),
         ({'relative_file_paths': [3]}, 'names no file'),
-        ({'relative_file_paths': ['../../etc/passwd']}, 'passwd: is named by metadata.yaml and is not there'),
+        ({'relative_file_paths': ['../../etc/passwd']}, 'passwd: is listed in metadata.yaml but missing'),
     ],
 )
 def test_bags_of_another_kind_are_rejected(tmp_path: Path, changes: dict[str, object], message: str) -> None:

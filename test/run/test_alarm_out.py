@@ -232,5 +232,5 @@ def test_no_recording_makes_a_replay_run_anything(tmp_path: Path, capsys: pytest
     recorded = rig_at_start(open_recording(tmp_path / 'rec'))
     assert recorded.acquisition.watch_command == f'touch {made}'
     assert main(['replay', str(tmp_path / 'rec'), '--watch']) == 0
-    assert 'is no longer its model' in capsys.readouterr().out
+    assert 'no longer matches its model' in capsys.readouterr().out
     assert not made.exists()

@@ -135,7 +135,7 @@ class BagRecording(Recording):
         for file in listed_files:
             if not file.is_file():
                 raise RecordingError(
-                    f'{file}: is named by metadata.yaml and is not there; `psd-deflection recover` makes that one anew'
+                    f'{file}: is listed in metadata.yaml but missing; `psd-deflection recover` rewrites metadata.yaml'
                 )
         for file in present_files:
             if file not in listed_files:
@@ -251,7 +251,7 @@ class BagRecording(Recording):
     def _without_namespace(self) -> dict[str, str]:
         """Topic without namespace by recorded topic; includes topics outside the namespace if the bag has one rig."""
         if not self.complete:
-            # Only a full pass shows all topics of a damaged file. No file has the topic '', so this search is one.
+            # Only a full pass shows all topics of a damaged file. No file has the topic '': the search reads all of it.
             self._first_message_on('')
         recorded_topics = self._known_topics()
         prefix = f'{self.namespace}/'
@@ -330,7 +330,7 @@ class BagRecording(Recording):
                 self._clock_leap_reported = True
                 self._add_warning(
                     f"the recorder's clock leapt by {leap_ns / 1e9:+.3f} s at log time {log_time} ns; "
-                    'samples keep their own times, marks and inputs without a stamp do not'
+                    'samples keep their own times; marks and inputs without a stamp are shifted by the leap'
                 )
             if batch and (len(batch) == _BATCH_MESSAGES or points.dtype != batch[0][1].dtype):
                 yield first_log_time, batch
@@ -399,7 +399,7 @@ class BagRecording(Recording):
         return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Return the unfiltered estimates by topic: primary, primary with covariance, and each solver's."""
+        """Return unfiltered estimates by topic: of the rig's ``solver``, the same with covariance, of each solver."""
         rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic

@@ -37,10 +37,10 @@ def test_a_sound_rig_has_no_alarm() -> None:
     assert isinstance(run, Recording)
     found = psd_deflection.watch(run)
     assert found.alarms == ()
-    assert found.sentences()[0].startswith('the rig is its model; watched: ')
+    assert found.sentences()[0].startswith('the rig matches its model; watched: ')
     assert found.tree()['same'] is True
     assert found.to_pandas().empty
-    assert 'the rig is its model' in found.report()
+    assert 'the rig matches its model' in found.report()
 
 
 @pytest.mark.slow
