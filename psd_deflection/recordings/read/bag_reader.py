@@ -135,7 +135,7 @@ class BagRecording(Recording):
         for file in listed_files:
             if not file.is_file():
                 raise RecordingError(
-                    f'{file}: is listed in metadata.yaml but missing; `psd-deflection recover` rewrites metadata.yaml'
+                    f'{file}: is listed in metadata.yaml but missing; `psd-deflection recover` makes metadata.yaml anew'
                 )
         for file in present_files:
             if file not in listed_files:
