@@ -49,8 +49,8 @@ class BlockInput:
     ``t_ns``: ROS time of the middle of the block, ns. ``index``: block number. ``slots`` (n,): places of the samples in
     the block, from 0. ``samples`` (n, 2P): dots, m; ``means`` (2P,): their means. ``mean_sums`` (P,): mean sum signals
     (total light), V. ``frozen`` (P,): for each PSD, in how many successive blocks, up to this one, its values did not
-    change. ``fully_published``: whether the parameter ``decimation`` selects this block; otherwise the dots, the tip
-    load and the other solvers' estimates are not published; the primary one is, but not on its solver's own topic.
+    change. ``fully_published``: whether the parameter ``decimation`` selects this block; otherwise only
+    the primary solver's estimate is published, not on that solver's own topic: no dots, tip load or other estimates.
     """
 
     t_ns: int
@@ -231,7 +231,7 @@ class Estimation:
         if readings is not None:
             self.estimator.full.fit.memory = readings.fitted.memory
             if verdict.findings:
-                # A finding warns of half or foreign light, say; the fit's covariance lacks the errors of such light.
+                # Half of the light may be lost, or other light be there: the fit's covariance lacks those errors.
                 readings = self._block_readings(readings.psds, readings.fitted, block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
@@ -270,8 +270,8 @@ class Estimation:
         # The check identifies a PSD by its place (from 1) in ``psd_set``.
         places = psd_set.check.candidates(solved.unexplained, self.estimator.limit_factor)
         without = {place: self._solve_without(place, block, variances, psd_set) for place in places}
-        blamed = [place for place, remaining in without.items() if self._is_consistent(remaining)]
-        solved = self._check(solved, blamed)
+        may_be_wrong = [place for place, remaining in without.items() if self._is_consistent(remaining)]
+        solved = self._check(solved, may_be_wrong)
         place = self._place_to_exclude(block, psd_set, solved.check_result)
         # A frozen PSD is excluded even if it was not among the candidates.
         if place and place not in without:
@@ -310,7 +310,7 @@ class Estimation:
         return self._solve_primary(readings)._replace(excluded_psd=psd_set.psds[place - 1] + 1)
 
     def _is_consistent(self, solved: SolvedReadings | None) -> bool:
-        """Return whether the readings can be checked and are consistent, with noise as the only error."""
+        """Return whether the readings can be checked and are consistent within their noise alone."""
         if solved is None or solved.solution is None:
             return False
         readings, unexplained = solved.readings, solved.unexplained
@@ -318,14 +318,16 @@ class Estimation:
             unexplained = self._unexplained(readings, solved.solution, readings.covariance)
         return readings.psds.check.agrees(unexplained, self.estimator.limit_factor)
 
-    def _check(self, solved: SolvedReadings, blamed: Collection[int] | None) -> SolvedReadings:
+    def _check(self, solved: SolvedReadings, may_be_wrong: Collection[int] | None) -> SolvedReadings:
         """Update the consistency check of the PSDs of ``solved``; return ``solved`` with the ``check_result``.
 
-        ``blamed``: places of the PSDs without which the others are consistent; None: no PSD may be excluded.
+        ``may_be_wrong``: places of the PSDs without which the others are consistent; None: no PSD may be excluded.
         """
         if solved.solution is None or not self.estimator.on_plate:
             return solved
-        return solved._replace(check_result=self.estimator.check(solved.readings.psds, solved.unexplained, blamed))
+        return solved._replace(
+            check_result=self.estimator.check(solved.readings.psds, solved.unexplained, may_be_wrong)
+        )
 
     def _place_to_exclude(self, block: BlockInput, psd_set: PsdSet, check_result: ConsistencyResult | None) -> int:
         """Return the place in ``psd_set`` of the PSD to exclude; 0: none."""
@@ -402,8 +404,12 @@ class Estimation:
         covariance, check_result = answer.noise, solved.check_result
         if solved.factor is not None:
             covariance = covariance + _pose_covariance(answer.gain, solved.factor, self._xp)
-        if check_result is not None and self._rig.estimator.consistency == 'widen' and any(check_result.possible):
-            covariance = widened(covariance, answer.gain, check_result.possible, self._xp)
+        if (
+            check_result is not None
+            and self._rig.estimator.consistency == 'widen'
+            and any(check_result.possible_errors)
+        ):
+            covariance = widened(covariance, answer.gain, check_result.possible_errors, self._xp)
         return covariance
 
     def _light_errors(self, block: BlockInput) -> tuple[float, FloatArray]:
@@ -451,7 +457,8 @@ class Estimation:
         vx, vy = variances[2 * psd : 2 * psd + 2]
         dx, dy, covariance = self._one_psd.solve(psd, (x, y), (vx, vy), theta, theta_variance)
         if self.parameter_covariance is not None:
-            # translation = l - R(theta) (c + dot), l: beam, c: centre of the PSD; d(translation)/d(dot) = -R(theta).
+            # translation = l - R(theta) (c + dot), so its slope by the dot is -R(theta). l, c: of the beam and of the
+            # PSD's centre on the unloaded plate.
             gain = np.zeros((3, 2 * len(self._rig.psds)))
             cos, sin = xp.cos_sin(theta)
             gain[:2, 2 * psd : 2 * psd + 2] = [[-cos, sin], [-sin, -cos]]

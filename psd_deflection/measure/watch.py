@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects from the records of a run when the rig no longer matches its model (terms: ``docs/glossary.md``).
 
-A reading is one coordinate of a dot (x1, y1, x2, y2 ..., m). A window is half a second of consecutive blocks, each with
+A reading is one coordinate of a dot, in m: x1, y1, x2 ... A window is half a second of consecutive blocks, each with
 an estimate from all PSDs. Three tests compare means over windows, the first and the third only while the tip rests:
 
 * **Readings**: while a known load acts, each reading must keep the level of its first windows under this load.
-* **Base line**: the distance between the dots of two PSDs, minus the distance between their beams, must keep its level.
+* **Base line**: the distance between the dots of two PSDs, minus that distance by the rig file, must keep its level.
   This difference depends neither on load nor on pose, so the test needs no known load.
 * **Load**: from one known load to the next, the pose must move as the link model predicts.
 
@@ -150,7 +150,7 @@ class _Channel:
         # CUSUMs of upward and downward shifts, and the start of the window in which each last became positive.
         self._sums, self._sums_since_ns = [0.0, 0.0], [0, 0]
         self.shifted, self.since_ns = False, 0
-        self._shifted_means: deque[float] = deque(maxlen=LEVEL_WINDOWS)
+        self._means_since_onset: deque[float] = deque(maxlen=LEVEL_WINDOWS)
 
     def discard_window(self) -> None:
         """Forget the blocks of the current window."""
@@ -203,9 +203,9 @@ class _Channel:
         larger = max(self._sums)
         self.shifted, self.since_ns = larger > ALARM_SUM, self._sums_since_ns[self._sums.index(larger)]
         if larger > 0.0:
-            self._shifted_means.append(self.mean)
+            self._means_since_onset.append(self.mean)
         else:
-            self._shifted_means.clear()
+            self._means_since_onset.clear()
             self.level += LEVEL_GAIN * (self.mean - self.level)
         return False
 
@@ -220,10 +220,10 @@ class _Channel:
 
     def shift(self) -> tuple[float, float]:
         """Return the shift of the last means from the level, and the standard deviation of the shift, m."""
-        n = len(self._shifted_means)
+        n = len(self._means_since_onset)
         if not n or self.level is None:
             return 0.0, self._mean_sd
-        shift = statistics.median(self._shifted_means) - self.level
+        shift = statistics.median(self._means_since_onset) - self.level
         return shift, self._mean_sd * math.sqrt(1.0 / n + 1.0 / LEVEL_WINDOWS)
 
 

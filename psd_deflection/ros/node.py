@@ -296,7 +296,7 @@ class BaseNode(abc.ABC, Generic[T]):
         self._starting = False
 
     def release(self) -> None:
-        """Carry out the transition ``cleanup``: the node is unconfigured. Each transition may call :meth:`cleanup`."""
+        """Carry out the transition ``cleanup``. Apart from :meth:`cleanup`, which other transitions call, too."""
         self.cleanup()
 
     def finish(self) -> None:

@@ -23,8 +23,8 @@ from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.realtime import SLOW, lag_reason
 
 QUEUED_PER_BLOCK = 100
-"""The queue holds at most ``queue_blocks`` times this many messages. One block (the samples of one estimate, every
-20 ms) makes about ten, so the default queue (250 blocks: 25,000 messages, 25 MB) outlasts a disk that hangs 50 s."""
+"""The queue holds at most ``queue_blocks`` times this many messages (default: 25,000 messages, 25 MB). A block (20 ms)
+makes only about ten, so this lasts for 2,500 blocks: a disk may hang for 50 s."""
 MOST_THREADS = 8
 """Limit of recorder threads: a further start is rejected. A stopped recording has a thread until its bag is closed."""
 QUEUE_BYTES = 100_000_000
@@ -32,7 +32,7 @@ QUEUE_BYTES = 100_000_000
 JOIN_S = 1.0
 """Length of one wait for a recorder thread at the end of the run, s (see :func:`_wait_for_writer`)."""
 PATIENCE_S = 3.0
-"""At the end of the run, no wait for a recorder thread begins later than this, s; one limit for all threads."""
+"""The end of the run waits about so long, s, for all recorder threads together."""
 IDLE_S = 0.5
 """If no message comes for this time, s, the recorder thread flushes the bag: a crash then loses no message."""
 GATHER_S = 0.005
@@ -45,7 +45,7 @@ RECORD_ELSEWHERE = 'record elsewhere (parameter bag_dir)'
 QueuedMessage = tuple[str, str, bytes, int]  # Topic, type name, message encoded as CDR, log time in ns.
 QueueItem = QueuedMessage | ParameterChange | None  # None ends the recording.
 StateGetter = Callable[[Rig], ParameterChange | None]
-"""``Pipeline.memory``: returns what the pipeline carries over from earlier blocks, as a change; None if nothing."""
+"""``Pipeline.memory``: returns the state that the pipeline carries over from earlier blocks, None if nothing."""
 
 
 def new_folder(parent: Path, stem: str = 'psd') -> Path:
@@ -98,8 +98,8 @@ class Recorder:
 
     ``queue_blocks``: the rig's parameter of this name. ``log`` gets a line for the first dropped message, each deleted
     file and each early end. ``between_blocks`` runs an action in the pipeline thread between two blocks
-    (``Processing.request``). ``dropped_samples`` returns how many samples the run had dropped before the chunk that was
-    processed last. ``node``: full name of the recorded ROS node.
+    (``Processing.request``). ``dropped_samples`` returns how many samples the run had dropped before the last ones that
+    were processed. ``node``: full name of the recorded ROS node.
 
     ``dropped``, ``written``: messages dropped and messages written, in all recordings of the run. ``files_deleted``:
     files deleted to make room. ``failure``: why the last recording ended early; empty once another one is attached.
@@ -227,10 +227,9 @@ class Recorder:
         for job, thread in tuple(self._writers.items()):
             _wait_for_writer(job, thread, deadline_s)
             if thread.is_alive():
-                why = (
-                    f'{job.folder}: {self._lag_reason(job)}; it is not waited for, and {job.budget.holders} messages '
-                    f'are not written. If the file is cut off, `psd-deflection recover {job.folder}` repairs it'
-                )
+                unwritten = f'the run ends without it, and {job.budget.holders} messages are not written'
+                repair = f'If the file is cut off, `psd-deflection recover {job.folder}` repairs it'
+                why = f'{job.folder}: {self._lag_reason(job)}; {unwritten}. {repair}'
                 if job.folder is not None:
                     self.failure = self.ended_early[job.folder] = why
                 self._log(why, WARNING)
@@ -284,7 +283,7 @@ class Recorder:
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
         """Return a new bag in ``bag_dir``. Raises RecordingError if the disk is nearly full or rejects the bag."""
         config = rig.acquisition
-        # bag_keep deletes complete files, so files must end: without bag_max_duration after a seventh of bag_keep.
+        # bag_keep deletes only complete files. If bag_max_duration is 0, a file ends after a seventh of bag_keep.
         file_s = config.bag_max_duration or config.bag_keep / 7.0
         with self._folder_lock:
             folder = new_folder(Path(config.bag_dir).expanduser())
@@ -319,7 +318,7 @@ class Recorder:
             except _DiskFullError as error:
                 # disk_reserve leaves room for the bag's index and summary.
                 bag.close()
-                return f'{bag.folder}: {error}; it is complete up to here'
+                return f'{bag.folder}: {error}; the bag is closed and complete up to this time'
             _require_in_place(bag)
             samples = job.samples_dropped_at_end - job.samples_dropped_at_start
             if samples or job.messages_dropped:
@@ -405,7 +404,7 @@ class Recorder:
 
 def _wait_for_writer(job: RecordingJob, thread: threading.Thread, deadline_s: float) -> None:
     """Wait until ``thread`` ends, the queue of ``job`` stops shrinking, or ``deadline_s`` (monotonic time) passes."""
-    # One more, so that an empty queue does not end the waiting after the first join: the thread may close the bag.
+    # + 1: with an empty queue, wait a second time, because the thread may still be closing the bag.
     remaining = job.queue.qsize() + 1
     while thread.is_alive() and time.monotonic() < deadline_s:
         before = remaining

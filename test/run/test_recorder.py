@@ -102,7 +102,10 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, dis
     disk.free = 150 * MB
     run.put(2 * CHECK_EVERY)
     text = run.heard()
-    assert 'the disk has 150 MB left, less than disk_reserve = 200 MB; it is complete up to here' in text
+    assert (
+        'the disk has 150 MB left, less than disk_reserve = 200 MB; the bag is closed and complete up to this time'
+        in text
+    )
     assert (text.count('\n'), run.recorder.folder) == (0, None)
     assert run.recorder.failure in text
     with Reader(run.folder) as reader:
@@ -543,7 +546,7 @@ def test_recording_holds_up_the_end_for_limited_time(
     if asked_for:
         live.session.record(False)
     live.session.close()
-    reported = live.heard('it is not waited for, and 0 messages are not written')
+    reported = live.heard('the run ends without it, and 0 messages are not written')
     assert reported.startswith(f'{folder}: ')
     assert not hanging_disk.go_on.is_set()
 

@@ -67,14 +67,14 @@ class ConsistencyResult(NamedTuple):
     """The check of one block.
 
     ``chi_square`` of this block, of ``freedom`` degrees. ``contradict``: this block, or one shortly before, is
-    inconsistent. ``errors`` (2N,) m: of each reading if its PSD alone is wrong. ``possible`` (2N,) m: the errors that
-    the covariance is to allow for. ``excluded``: the PSD to exclude, from 1 among those that are checked; 0: none.
+    inconsistent. ``errors`` (2N,) m: of each reading if its PSD alone is wrong. ``possible_errors`` (2N,) m: those
+    that the covariance is to allow for. ``excluded``: the PSD to exclude, from 1 among those that are checked; 0: none.
     """
 
     chi_square: float
     contradict: bool
     errors: tuple[float, ...]
-    possible: tuple[float, ...]
+    possible_errors: tuple[float, ...]
     excluded: int = 0
     freedom: int = 1
 

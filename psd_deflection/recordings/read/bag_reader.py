@@ -167,28 +167,30 @@ class BagRecording(Recording):
         """Read parameters, versions, ``hello`` (device description), changes and pipeline states from topic ``RIG``."""
         # The keys are an ordered set: a node may send the same change again.
         changes: dict[ParameterChange, None] = {}
-        # Parameters of the first rig, with all changes so far.
-        first_rig: dict[str, object] = {}
+        # The first recorded parameters with all changes so far; other parameters are those of another rig.
+        expected_parameters: dict[str, object] = {}
         for channel, log_time, message in self.messages([RIG]):
             if channel.type != TOPIC_TYPES[RIG] or channel.encoding != 'cdr':
                 continue
             try:
                 rig_state = string.to_rig(cdr.decode(channel.type, message))
-                t_ns, block, memory = rig_state.t_ns, rig_state.block, rig_state.memory
+                t_ns, block, state = rig_state.t_ns, rig_state.block, rig_state.memory
                 change = _to_change(t_ns, block, rig_state.changed)
                 # FULL marks a change that replaces the complete state of a pipeline.
-                pipeline_state = None if memory is None else _to_change(t_ns, block, {FULL: 1.0, **memory})
+                pipeline_state = None if state is None else _to_change(t_ns, block, {FULL: 1.0, **state})
             except (ValueError, TypeError) as error:
                 self._add_warning(f'{RIG} at log time {log_time} ns is not readable ({error}) and is left out')
                 continue
             if not self.parameters:
                 self.parameters, self.version = rig_state.parameters, rig_state.version
                 self.made_with = rig_state.made_with
-                first_rig = dict(rig_state.parameters)
+                expected_parameters = dict(rig_state.parameters)
             if self.hello is None:
                 self.hello = rig_state.hello
-            first_rig |= {name: value for name, value in rig_state.changed.items() if name in first_rig}
-            if first_rig != rig_state.parameters and change not in changes:
+            expected_parameters |= {
+                name: value for name, value in rig_state.changed.items() if name in expected_parameters
+            }
+            if expected_parameters != rig_state.parameters and change not in changes:
                 self._add_warning(f'another rig starts at log time {log_time} ns; the first one is taken for all')
             if change.values:
                 changes[change] = None
@@ -249,7 +251,7 @@ class BagRecording(Recording):
 
     @functools.cached_property
     def _without_namespace(self) -> dict[str, str]:
-        """Topic without namespace by recorded topic; includes topics outside the namespace if the bag has one rig."""
+        """Map each recorded topic to its name without the namespace; if the bag has one rig, also topics outside it."""
         if not self.complete:
             # Only a full pass shows all topics of a damaged file. No file has the topic '': the search reads all of it.
             self._first_message_on('')
@@ -291,7 +293,8 @@ class BagRecording(Recording):
         for log_time, messages in self._message_batches():
             batch = joined_points(messages)
             where = f'{self.path}: {SAMPLES} at log time {log_time} ns'
-            # Where a sample number or a time goes back (wrap, restart), messages are numbered one by one.
+            # Where a sample number or a time goes back (wrap, restart), messages are numbered one by one. ``full``: the
+            # numbers were recorded with their high bits.
             is_continuous = numbering.follows(batch.seq, batch.t_ns, batch.full)
             parts = [batch] if is_continuous else [joined_points([message]) for message in messages]
             for part in parts:
@@ -399,7 +402,7 @@ class BagRecording(Recording):
         return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Return unfiltered estimates by topic: of the rig's ``solver``, the same with covariance, of each solver."""
+        """Return unfiltered estimates by topic: the main one without and with covariance, and that of each solver."""
         rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic

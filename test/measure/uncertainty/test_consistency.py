@@ -79,7 +79,7 @@ def test_the_state_follows_its_laws_through_any_blocks() -> None:
         assert got.chi_square == pytest.approx(chi_square, abs=1e-9)
         assert got.contradict == (held > 0.0)
         np.testing.assert_allclose(got.errors, r / along, rtol=1e-9)
-        np.testing.assert_allclose(got.possible, root / along, rtol=1e-9)
+        np.testing.assert_allclose(got.possible_errors, root / along, rtol=1e-9)
         np.testing.assert_allclose(of.state(), (0.0, 0.0, held, mean, lasting), rtol=1e-9, atol=1e-18)
         observed.add((held > 0.0, lasting > 0.0, doubtful))
     assert len(observed) > 5
@@ -188,14 +188,14 @@ def test_limits(times: float) -> None:
         got = check(four(), with_error(2, (1.0, 0.5), share * times * doubtful), times=times)
         # Half as much again as the error of a PSD alone, and both of its readings may be wrong together.
         want = 1.5 * 2.0**0.5 * np.abs(got.errors) if widens else np.zeros(2 * PSDS)
-        np.testing.assert_allclose(got.possible, want, rtol=1e-12)
+        np.testing.assert_allclose(got.possible_errors, want, rtol=1e-12)
 
 
 @pytest.mark.parametrize('psd', range(1, PSDS + 1))
 def test_the_only_psd_to_blame_is_left_out_for_a_second(psd: int) -> None:
     checks = four()
     first = check(checks, with_error(psd, (1.0, 0.5), 2.0 * LIMIT), {psd})
-    assert (first.excluded, first.contradict, first.possible) == (psd, True, (0.0,) * (2 * PSDS))
+    assert (first.excluded, first.contradict, first.possible_errors) == (psd, True, (0.0,) * (2 * PSDS))
     blocks = 0
     while check(checks, with_error(psd, (0.0, 0.0)), {psd}).excluded:
         blocks += 1
@@ -210,7 +210,7 @@ def test_two_outlier_candidates_stay_with_both_errors() -> None:
     got = check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {1, 3})
     assert (got.excluded, got.contradict) == (0, True)
     want = 1.5 * 2.0**0.5 * np.abs(got.errors) * np.repeat([1, 0, 1, 0], 2)
-    np.testing.assert_allclose(got.possible, want, rtol=1e-12)
+    np.testing.assert_allclose(got.possible_errors, want, rtol=1e-12)
     checks = four()
     check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {3})
     assert check(checks, with_error(3, (1.0, 0.5), 2.0 * LIMIT), {1, 3}).excluded == 3
