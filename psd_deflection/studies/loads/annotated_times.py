@@ -220,12 +220,12 @@ def unannotated_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[flo
         return []
     width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
     steps = lasting_steps(dots, width)
-    edges = [0.0, *(s.at for s in steps), float(len(dots))]
+    between = calm_between(steps, len(dots), width, period)
     out = []
     for j, step in enumerate(steps):
         near = (changes >= step.first - 2 * width) & (changes <= step.last + 2 * width)
         if not near.any():
-            out.append(time_of_step(rig, dots, step, (edges[j], edges[j + 2]), period)[0])
+            out.append(time_of_step(rig, dots, step, between[j], period)[0])
     return out
 
 
@@ -241,11 +241,10 @@ def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> Corrected
     if not matched:
         return None
     delays = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
-    long = np.array([steps[j].last - steps[j].first > 2.0 * width + GRADUAL_S / period for _, j in matched])
-    if are_alike(delays, ALIKE_S) and not long.any():
+    if are_alike(delays, ALIKE_S) and not any(_duration(steps[j], width, period) for _, j in matched):
         return None
-    edges = [0.0, *(s.at for s in steps), float(len(dots))]
-    fitted = {i: time_of_step(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
+    between = calm_between(steps, len(dots), width, period)
+    fitted = {i: time_of_step(rig, dots, steps[j], between[j], period) for i, j in matched}
     delays = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     # One delay is left to a search, unless it would have to find it from what was lost.
     unseen = abs(float(np.median(delays))) > ALIKE_S and any(steps[j].lost for _, j in matched)
@@ -256,6 +255,20 @@ def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> Corrected
     if BETTER * residual > residual_of_dots(rig, dots, loads)[0]:
         return None
     return replace(without_rough_motion(rig, corrected, [n for n in timed if n.wrong], rest), timed=tuple(timed))
+
+
+def _duration(step: DotStep, width: int, period: float) -> float:
+    """Return for how many samples the dots of a gradual step move, about; 0 of a sudden one."""
+    duration = step.last - step.first - 2.0 * width
+    return duration if duration > GRADUAL_S / period else 0.0
+
+
+def calm_between(steps: Sequence[DotStep], samples: int, width: int, period: float) -> list[tuple[float, float]]:
+    """Return for each step the samples between which no other one moves the dots."""
+    half = [0.5 * _duration(step, width, period) for step in steps]
+    ends = [0.0, *(step.at + more for step, more in zip(steps, half, strict=True))]
+    starts = [*(step.at - more for step, more in zip(steps, half, strict=True)), float(samples)]
+    return list(zip(ends, starts[1:], strict=False))
 
 
 def loads_with_times(

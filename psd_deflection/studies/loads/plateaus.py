@@ -105,7 +105,8 @@ def plateaus(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateauLoads:
-    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the annotated one, N, N, N m.
+    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the annotated one, N, N,
+    N m; 0 if there are no readings of it.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
     ``beside`` (2P - 3, m): what no movement of the plate makes, m.
@@ -145,12 +146,13 @@ def implied_loads(
     compliance = np.diag(LinkStatics.from_rig(rig).compliance)
     there: BoolArray = np.isfinite(moved).all(axis=0) & _held(listed, samples, size, moved.shape[1])
     more, rest = np.zeros((len(listed), 3)), np.full_like(moved, np.nan)
+    # The ringing after a hold that was left out does not say which load it was.
+    shown = [k for k, p in enumerate(listed) if there[p.first // size : p.last // size].any()]
     for axis in range(3):
-        columns = np.array(
-            [np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(rig, samples, listed, axis))]
-        )
+        pulses = _pulses(rig, samples, [listed[k] for k in shown], axis)
+        columns = np.array([np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in pulses)])
         solution = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
-        more[:, axis] = solution[1:] / compliance[axis]
+        more[shown, axis] = solution[1:] / compliance[axis]
         rest[axis, there] = moved[axis, there] - solution @ columns[:, there]
     beside = np.where(there, across_plate(rig, difference), np.nan)
     across = np.array([[_mean(row[p.first // size : p.last // size]) for p in listed] for row in beside])
