@@ -49,8 +49,8 @@ class BlockInput:
     ``t_ns``: ROS time of the middle of the block, ns. ``index``: block number. ``slots`` (n,): places of the samples in
     the block, from 0. ``samples`` (n, 2P): dots, m; ``means`` (2P,): their means. ``mean_sums`` (P,): mean sum signals
     (total light), V. ``frozen`` (P,): for each PSD, in how many successive blocks, up to this one, its values did not
-    change. ``fully_published``: whether the parameter ``decimation`` selects this block; otherwise only
-    the primary solver's estimate is published, not on that solver's own topic: no dots, tip load or other estimates.
+    change. ``fully_published``: whether the parameter ``decimation`` selects this block; if not, only
+    the primary estimate is published, on ``/link_tip/deflection``; dots, tip load and the solvers' topics are skipped.
     """
 
     t_ns: int
@@ -185,9 +185,9 @@ class Estimation:
         return self.primary.gain(zero_dots, variances, self.primary.solve(zero_dots, variances))
 
     def vibration(self, tones: Sequence[Tone]) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances (3, 3) of pose and pose rate, SI units, of ``tones``, sinusoidal vibrations.
+        """Return the covariances (3, 3) of pose and pose rate, SI units, that ``tones`` cause.
 
-        Their frequencies are in cycles per sample."""
+        Tones are sinusoidal vibrations; their frequencies are in cycles per sample."""
         gain = self.gain_at_rest()
         pose_covariance, rate_covariance = np.zeros((3, 3)), np.zeros((3, 3))
         for tone in tones:
@@ -231,7 +231,7 @@ class Estimation:
         if readings is not None:
             self.estimator.full.fit.memory = readings.fitted.memory
             if verdict.findings:
-                # Half of the light may be lost, or other light be there: the fit's covariance lacks those errors.
+                # If half of the light is lost or there is background light, the fit's covariance lacks those errors.
                 readings = self._block_readings(readings.psds, readings.fitted, block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
@@ -398,7 +398,7 @@ class Estimation:
         )
 
     def _covariance(self, answer: SolverAnswer, solved: SolvedReadings) -> FloatArray | None:
-        """Return the pose covariance (3, 3) by noise, calibration and inconsistency; None if no noise is known."""
+        """Return the pose covariance (3, 3) by noise, calibration and inconsistency; None if the solver has none."""
         if answer.gain is None or answer.noise is None:
             return None
         covariance, check_result = answer.noise, solved.check_result
@@ -457,8 +457,8 @@ class Estimation:
         vx, vy = variances[2 * psd : 2 * psd + 2]
         dx, dy, covariance = self._one_psd.solve(psd, (x, y), (vx, vy), theta, theta_variance)
         if self.parameter_covariance is not None:
-            # translation = l - R(theta) (c + dot), so its slope by the dot is -R(theta). l, c: of the beam and of the
-            # PSD's centre on the unloaded plate.
+            # translation = l - R(theta) (c + dot), so its derivative by the dot is -R(theta). l, c: places of the
+            # beam and of the PSD's centre on the unloaded plate, m.
             gain = np.zeros((3, 2 * len(self._rig.psds)))
             cos, sin = xp.cos_sin(theta)
             gain[:2, 2 * psd : 2 * psd + 2] = [[-cos, sin], [-sin, -cos]]

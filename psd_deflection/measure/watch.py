@@ -12,7 +12,7 @@ an estimate from all PSDs. Three tests compare means over windows, the first and
 
 The first two tests are two-sided CUSUMs (Page, Biometrika 41 (1954) 100) with a dead zone: twice the standard deviation
 of a window's mean or the parameter ``watch_wander``, whichever is larger. After a sum has exceeded ``ALARM_SUM``, the
-alarm waits for ``CONFIRM_S``: people annotate a load after they have applied it, and a new load cancels the alarm.
+alarm waits for ``CONFIRM_S``: people annotate a load after they have applied it; a new load cancels a waiting alarm.
 Without a known load, the alarm does not wait. No test uses a clock or a thread, so the same records cause the same
 alarms, live and in replay.
 """
@@ -300,7 +300,7 @@ class Watch:
         self._recent.clear()
         for channel in self._readings:
             channel.forget_level()
-        # The new load explains a pending shift. A present alarm cannot end by recovery: readings have no level now.
+        # The new load explains a pending shift. A present alarm must not end by recovery: new levels include the shift.
         self._pending_ns = None
         self._alarm_until_restart = self.alarm is not None
 

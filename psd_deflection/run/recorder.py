@@ -23,8 +23,8 @@ from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.realtime import SLOW, lag_reason
 
 QUEUED_PER_BLOCK = 100
-"""The queue holds at most ``queue_blocks`` times this many messages (default: 25,000 messages, 25 MB). A block (20 ms)
-makes only about ten, so this lasts for 2,500 blocks: a disk may hang for 50 s."""
+"""Limit of the queue in messages, per block of ``queue_blocks`` (default: 25,000 messages, 25 MB). A block (20 ms)
+makes only about ten, so the queue fills in 2,500 blocks: no message is lost until the disk has hung for 50 s."""
 MOST_THREADS = 8
 """Limit of recorder threads: a further start is rejected. A stopped recording has a thread until its bag is closed."""
 QUEUE_BYTES = 100_000_000
@@ -45,7 +45,7 @@ RECORD_ELSEWHERE = 'record elsewhere (parameter bag_dir)'
 QueuedMessage = tuple[str, str, bytes, int]  # Topic, type name, message encoded as CDR, log time in ns.
 QueueItem = QueuedMessage | ParameterChange | None  # None ends the recording.
 StateGetter = Callable[[Rig], ParameterChange | None]
-"""``Pipeline.memory``: returns the state that the pipeline carries over from earlier blocks, None if nothing."""
+"""``Pipeline.memory``: the state that the pipeline carries over from earlier blocks, as a ParameterChange, or None."""
 
 
 def new_folder(parent: Path, stem: str = 'psd') -> Path:
@@ -76,12 +76,12 @@ class RecordingJob:
     def __init__(self, config: AcquisitionConfig) -> None:
         self.config = config
         self.folder: Path | None = None  # None until the bag is open.
-        self.attached = False  # Stays True when the recording is detached.
+        self.was_attached = False  # Never reset: also True of a recording that is detached.
         self.last_step_s = time.monotonic()  # Monotonic time of the recorder thread's last step, s.
         self.queue: queue.SimpleQueue[QueueItem] = queue.SimpleQueue()  # Bound: QUEUE_BYTES.
         self.opened: Future[Path | None] = Future()
         self.closed: Future[Path | None] = Future()
-        self.budget = ByteBudget(QUEUE_BYTES)  # Bytes of the messages in the queue.
+        self.budget = ByteBudget(QUEUE_BYTES)  # Bytes (held) and number (holders) of the messages in the queue.
         # Samples that the run had dropped when this recording began, and when it ended.
         self.samples_dropped_at_start = self.samples_dropped_at_end = 0
         self.messages_dropped = 0  # Dropped because the queue was full.
@@ -98,8 +98,8 @@ class Recorder:
 
     ``queue_blocks``: the rig's parameter of this name. ``log`` gets a line for the first dropped message, each deleted
     file and each early end. ``between_blocks`` runs an action in the pipeline thread between two blocks
-    (``Processing.request``). ``dropped_samples`` returns how many samples the run had dropped before the last ones that
-    were processed. ``node``: full name of the recorded ROS node.
+    (``Processing.request``). ``dropped_samples`` returns how many samples the run had dropped up to the one that was
+    processed last. ``node``: full name of the recorded ROS node.
 
     ``dropped``, ``written``: messages dropped and messages written, in all recordings of the run. ``files_deleted``:
     files deleted to make room. ``failure``: why the last recording ended early; empty once another one is attached.
@@ -227,7 +227,7 @@ class Recorder:
         for job, thread in tuple(self._writers.items()):
             _wait_for_writer(job, thread, deadline_s)
             if thread.is_alive():
-                unwritten = f'the run ends without it, and {job.budget.holders} messages are not written'
+                unwritten = f'the run ends before its bag is closed: {job.budget.holders} messages are not written'
                 repair = f'If the file is cut off, `psd-deflection recover {job.folder}` repairs it'
                 why = f'{job.folder}: {self._lag_reason(job)}; {unwritten}. {repair}'
                 if job.folder is not None:
@@ -260,13 +260,13 @@ class Recorder:
                 self._writers[job] = thread
                 job.samples_dropped_at_start = job.samples_dropped_at_end = self._dropped_samples()
                 self._opening, self._attached = None, job
-                job.attached, self.failure = True, ''
+                job.was_attached, self.failure = True, ''
 
         try:
             self._between_blocks(attach)
         except Exception as error:
             self._reject(job, error)
-        if not job.attached:  # A request that timed out may still have attached the job.
+        if not job.was_attached:  # A request that timed out may still have attached the job.
             with contextlib.suppress(OSError, RecordingError):
                 bag.discard()
             return
@@ -404,7 +404,7 @@ class Recorder:
 
 def _wait_for_writer(job: RecordingJob, thread: threading.Thread, deadline_s: float) -> None:
     """Wait until ``thread`` ends, the queue of ``job`` stops shrinking, or ``deadline_s`` (monotonic time) passes."""
-    # + 1: with an empty queue, wait a second time, because the thread may still be closing the bag.
+    # + 1: wait twice if the queue is empty, because the thread may still be closing the bag.
     remaining = job.queue.qsize() + 1
     while thread.is_alive() and time.monotonic() < deadline_s:
         before = remaining

@@ -546,7 +546,7 @@ def test_recording_holds_up_the_end_for_limited_time(
     if asked_for:
         live.session.record(False)
     live.session.close()
-    reported = live.heard('the run ends without it, and 0 messages are not written')
+    reported = live.heard('the run ends before its bag is closed: 0 messages are not written')
     assert reported.startswith(f'{folder}: ')
     assert not hanging_disk.go_on.is_set()
 

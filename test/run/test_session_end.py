@@ -69,7 +69,7 @@ class Hanging:
     [
         ('acquisition', 'the source hangs; it is not waited for'),
         ('processing', 'the last block is not waited for'),
-        ('recorder', 'the run ends without it, and 0 messages are not written.'),
+        ('recorder', 'the run ends before its bag is closed: 0 messages are not written.'),
     ],
 )
 def test_part_that_hangs_delays_end_by_two_seconds(

@@ -65,8 +65,8 @@ MAX_YAML_BYTES = 16_000_000
 """Largest ``metadata.yaml`` that is read, bytes: the file is untrusted input."""
 
 MAX_PIPELINE_STATES = 4
-"""Recorded pipeline states (what the processing carries from one block to the next) that are kept. A replay needs only
-the first state at or after its first block."""
+"""Recorded pipeline states (``memories``) that are kept: what the processing carries from one block to the next. A
+replay needs only the first one at or after its first block."""
 
 MAX_RESTARTS = 10_000
 """Device restarts that are kept: a bound on memory."""
@@ -167,17 +167,17 @@ class BagRecording(Recording):
         """Read parameters, versions, ``hello`` (device description), changes and pipeline states from topic ``RIG``."""
         # The keys are an ordered set: a node may send the same change again.
         changes: dict[ParameterChange, None] = {}
-        # The first recorded parameters with all changes so far; other parameters are those of another rig.
+        # What the next message must have: the first recorded parameters with all changes so far.
         expected_parameters: dict[str, object] = {}
         for channel, log_time, message in self.messages([RIG]):
             if channel.type != TOPIC_TYPES[RIG] or channel.encoding != 'cdr':
                 continue
             try:
                 rig_state = string.to_rig(cdr.decode(channel.type, message))
-                t_ns, block, state = rig_state.t_ns, rig_state.block, rig_state.memory
+                t_ns, block, memory = rig_state.t_ns, rig_state.block, rig_state.memory
                 change = _to_change(t_ns, block, rig_state.changed)
                 # FULL marks a change that replaces the complete state of a pipeline.
-                pipeline_state = None if state is None else _to_change(t_ns, block, {FULL: 1.0, **state})
+                pipeline_state = None if memory is None else _to_change(t_ns, block, {FULL: 1.0, **memory})
             except (ValueError, TypeError) as error:
                 self._add_warning(f'{RIG} at log time {log_time} ns is not readable ({error}) and is left out')
                 continue
@@ -251,9 +251,9 @@ class BagRecording(Recording):
 
     @functools.cached_property
     def _without_namespace(self) -> dict[str, str]:
-        """Map each recorded topic to its name without the namespace; if the bag has one rig, also topics outside it."""
+        """Map each recorded topic to its name without the namespace; topics outside it only if the bag has one rig."""
         if not self.complete:
-            # Only a full pass shows all topics of a damaged file. No file has the topic '': the search reads all of it.
+            # Only a full pass shows all topics of a damaged file. The topic '' never occurs: the search is such a pass.
             self._first_message_on('')
         recorded_topics = self._known_topics()
         prefix = f'{self.namespace}/'

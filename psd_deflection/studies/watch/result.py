@@ -33,7 +33,7 @@ class WatchedRun(StudyResult):
     seconds: float = 0.0
 
     study = 'watch'
-    title = 'Is the rig still its model?'
+    title = 'Does the rig still match its model?'
     json_name = 'watch.json'
 
     def since_s(self, alarm: Alarm) -> float:
