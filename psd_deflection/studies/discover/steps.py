@@ -17,7 +17,7 @@ from psd_deflection.studies.discover.problem import Machine, Problem, Progress, 
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, heldout_gain, heldout_tables, refit
 from psd_deflection.studies.discover.search.predictive import predictive_of
-from psd_deflection.studies.discover.search.search import Search
+from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.smooth import Remainder, remainder_of
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
@@ -68,9 +68,26 @@ def search(problem: Problem, begun: Fit | None = None) -> Problem:
         cost = plain_result.fit.chi2 + plain_search.penalty * plain_result.fit.parameters
         if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_ACCEPT:
             search_used, result = plain_search, plain_result
+    search_used, result = _with_one_cause(problem, search_used, result)
     if not start.open_level:
         search_used = search_used.at(search_used.workspace.replaced(nuisance=result.fit.nuisance))
     return replace(problem, search=search_used, result=result, fit=result.fit, null=result.null)
+
+
+def _with_one_cause(problem: Problem, search_used: Search, result: SearchResult) -> tuple[Search, SearchResult]:
+    """Return the search and its result, with a wrong number of the rig file in place of effects that do the same."""
+    first = problem.comparison.first
+    if not first or len(result.fit.effects) < 2:
+        return search_used, result
+    asking = search_used
+    if not search_used.workspace.first:
+        asking = Search(search_used.workspace.replaced(first=first), problem.machine.screen, problem.progress)
+    fit = asking.with_one_cause(result.fit)
+    if fit is result.fit:
+        return search_used, result
+    p, delta_bic, delta_chi2 = asking.weigh(result.null, fit)
+    fits = [asking.alternatives(result.null, fit, i, gain) for i, gain in enumerate(delta_chi2)]
+    return asking, replace(result, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=fits)
 
 
 def weigh(problem: Problem) -> Problem:

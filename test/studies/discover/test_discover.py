@@ -477,6 +477,12 @@ def ordered(*columns: int) -> Callable[[FloatArray], FloatArray]:
     return lambda volts: volts[:, list(columns)]
 
 
+def in_unit(loads: str, factor: float, units: str) -> list[tuple[str, str, float, str]]:
+    columns = ' '.join(f'load_{name}' for name in loads.split())
+    words = f'multiply {columns} in the recording by {factor:g}: it is noted in {units}'
+    return [('load_unit', loads, factor, words)]
+
+
 @pytest.mark.parametrize(
     ('mistake', 'named'),
     [
@@ -487,28 +493,8 @@ def ordered(*columns: int) -> Callable[[FloatArray], FloatArray]:
         (lambda o: changed(o, ordered(3, 4, 5, 0, 1, 2)), [('psd_swap', 'psd_1 psd_2', None, 'psds_exchanged: true')]),
         (lambda o: loaded(o, 1.0, -1.0, 1.0), [('load_sign', 'fy', -1.0, 'turn the sign of load_fy in the recording')]),
         (lambda o: loaded(o, 1.0, 1.0, -1.0), [('load_sign', 'tz', -1.0, 'turn the sign of load_tz in the recording')]),
-        (
-            lambda o: loaded(o, 1 / 9.80665, 1 / 9.80665, 1.0),
-            [
-                (
-                    'load_unit',
-                    'fx fy',
-                    9.80665,
-                    'multiply load_fx load_fy in the recording by 9.80665: it is noted in kg instead of N',
-                )
-            ],
-        ),
-        (
-            lambda o: loaded(o, 1.0, 1.0, 1e3),
-            [
-                (
-                    'load_unit',
-                    'tz',
-                    1e-3,
-                    'multiply load_tz in the recording by 0.001: it is noted in N mm instead of N m',
-                )
-            ],
-        ),
+        (lambda o: loaded(o, 1 / 9.80665, 1 / 9.80665, 1.0), in_unit('fx fy', 9.80665, 'kg instead of N')),
+        (lambda o: loaded(o, 1.0, 1.0, 1e3), in_unit('tz', 1e-3, 'N mm instead of N m')),
     ],
 )
 def test_wiring_signs_and_units_are_put_right(
@@ -556,10 +542,12 @@ def found_in(*observations: Observation, full: bool = False) -> Discovery:
 
 
 @pytest.mark.slow
-def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
+@pytest.mark.parametrize('beside', [[], ['sensor_gain,psd=1,x=0.01']])
+def test_a_wrong_length_is_named_alone_and_beside_an_effect(beside: list[str]) -> None:
     """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
-    found = found_in(recorded(link__length=0.585 * 1.02), full=True)
-    assert (found.verdict, found.effects) == ('nothing_missing', ())
+    true = with_effects(replace_values(RIG, {'link.length': 0.585 * 1.02}), beside, 'test')
+    found = found_in(observe(true, 3), full=True)
+    assert [effect.name for effect in found.effects] == [words.split(',')[0] for words in beside]
     (mistake,) = found.setup
     assert (mistake.name, mistake.where) == ('link_length', 'link.length')
     assert mistake.value == pytest.approx(1.02, abs=1e-4)
