@@ -133,7 +133,7 @@ class Estimation:
         self.held: HeldTwist | None = None
         self.systematic: FloatArray | None = None
         self.build(rig, effects)
-        # After build(), whose solvers reject a geometry that cannot be solved.
+        # This must follow build(), so that its solvers reject a geometry that cannot be solved.
         # PSDs on the plate: their noise is measured, and their readings are checked. At the base: neither.
         self.estimator = BlockEstimator(rig, on_plate=not rig.psds_at_base, tilts=solver_class(config.solver).tilts)
 
@@ -250,8 +250,8 @@ class Estimation:
             if answer.solution is not None:
                 yield self._estimate(solver_number, block, answer.solution, self._covariance(answer, solved))
 
-    def excluded_psds(self, solved: SolvedReadings | None) -> tuple[int, ...]:
-        """Return the numbers (from 1) of the PSDs whose readings are not in ``solved``; () for None."""
+    def missing_psds(self, solved: SolvedReadings | None) -> tuple[int, ...]:
+        """Return the numbers (from 1) of the PSDs, faulty or contradicting, that are not in ``solved``; () for None."""
         if solved is None:
             return ()
         return tuple(n for n in range(1, len(self._rig.psds) + 1) if n - 1 not in solved.readings.psds.psds)
@@ -270,6 +270,7 @@ class Estimation:
         # The check identifies a PSD by its place (from 1) in ``psd_set``.
         places = psd_set.check.candidates(solved.unexplained, self.estimator.limit_factor)
         without = {place: self._solve_without(place, block, variances, psd_set) for place in places}
+        # A PSD may be wrong if the others are consistent without it.
         may_be_wrong = [place for place, remaining in without.items() if self._is_consistent(remaining)]
         solved = self._check(solved, may_be_wrong)
         place = self._place_to_exclude(block, psd_set, solved.check_result)
@@ -417,7 +418,7 @@ class Estimation:
 
         Without a finding in the verdict, the factor is 1 and the variances of sound PSDs are 0.
         """
-        # One of two lasers behind a beam splitter is lost: half the light doubles the noise.
+        # One of two lasers behind a beam splitter is lost: half the light doubles the noise: four times the variance.
         factor = 4.0 if block.verdict.half_light else 1.0
         return factor, np.repeat(self._optics.background_variance(block.mean_sums), 2)
 

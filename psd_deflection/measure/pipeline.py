@@ -375,7 +375,7 @@ class Pipeline:
         answer = self.estimation.solve(observed, readings) if solvable else BlockSolution(observed.means)
         self.last_estimate = answer.estimate
         fitted = None if answer.solved is None else answer.solved.readings.fitted
-        self.estimator.record(fitted, self.estimation.excluded_psds(answer.solved))
+        self.estimator.record(fitted, self.estimation.missing_psds(answer.solved))
         status, reason = answer.failure or (verdict.status, verdict.reason)
         self._count(status, verdict, answer)
         yield from self._estimates(observed, answer, status)

@@ -6,7 +6,7 @@ A reading is one coordinate of a dot, in m: x1, y1, x2 ... A window is half a se
 an estimate from all PSDs. Three tests compare means over windows, the first and the third only while the tip rests:
 
 * **Readings**: while a known load acts, each reading must keep the level of its first windows under this load.
-* **Base line**: the distance between the dots of two PSDs, minus that distance by the rig file, must keep its level.
+* **Base line**: the distance between the dots of two PSDs, minus that expected from the rig file, must keep its level.
   This difference depends neither on load nor on pose, so the test needs no known load.
 * **Load**: from one known load to the next, the pose must move as the link model predicts.
 
@@ -64,7 +64,7 @@ CONFIRM_S = 3.0
 LEVEL_GAIN = 1.0 / 120.0
 """Weight of a new window in the level while both sums are 0: the level follows drift with a time constant of 60 s."""
 BASE_LINE_FRACTION = 0.002
-"""Fraction of the tip's movement that is added to ``watch_wander`` for base lines; ``discover`` permits the same."""
+"""Fraction of the tip's movement that is added to ``watch_wander`` for base lines, as in ``discover``."""
 POSE_TOLERANCES = {'dx': 5e-6, 'dy': 5e-6, 'theta': 40e-6}
 """Permitted error of the link model at zero movement: m, m, rad."""
 POSE_FRACTION = 0.02
@@ -147,7 +147,7 @@ class _Channel:
         self._level_means: list[float] = []  # Bound: LEVEL_WINDOWS.
         self.level: float | None = None
         self._last_mean: float | None = None
-        # CUSUMs of upward and downward shifts, and the start of the window in which each last became positive.
+        # CUSUMs of upward and downward shifts; for each, when the window began in which it became positive.
         self._sums, self._sums_since_ns = [0.0, 0.0], [0, 0]
         self.shifted, self.since_ns = False, 0
         self._means_since_onset: deque[float] = deque(maxlen=LEVEL_WINDOWS)
@@ -271,7 +271,7 @@ class Watch:
         self._good_windows = 0
         self._pending_ns: int | None = None  # Before an alarm: time since which a channel is shifted.
         self._base_line_pose: list[float] | None = None  # Pose at which the levels of the base lines became known.
-        self._reference: tuple[list[float], list[float]] | None = None  # Pose and deviation under an earlier load.
+        self._earlier: tuple[list[float], list[float]] | None = None  # Pose and deviation under an earlier load.
         # Windows without motion under the known load: those of the last CONFIRM_S, and LEVEL_WINDOWS before them.
         self._recent: deque[_PoseWindow] = deque(maxlen=LEVEL_WINDOWS + round(CONFIRM_S / WINDOW_S))
 
@@ -296,7 +296,7 @@ class Watch:
         earliest_ns = load.t_ns - round(1e9 * CONFIRM_S)
         windows_before = [window for window in self._recent if window.end_ns <= earliest_ns]
         if self._readings[0].level is not None and windows_before:
-            self._reference = _median_pose(windows_before[-LEVEL_WINDOWS:])
+            self._earlier = _median_pose(windows_before[-LEVEL_WINDOWS:])
         self._recent.clear()
         for channel in self._readings:
             channel.forget_level()
@@ -333,7 +333,7 @@ class Watch:
         self._add_dots(spots.dots)
         self._pose_sum = [total + value for total, value in zip(self._pose_sum, estimate.pose, strict=True)]
         if self.load is not None and tip_load is not None and tip_load.t_ns == estimate.t_ns:
-            # tip_load is the load for which the link model predicts the estimated pose.
+            # tip_load: the load computed from the estimated pose by the inverse link model.
             rows = zip(self._deviation_sum, self._compliance, tip_load[1:], self.load[1:], strict=True)
             self._deviation_sum = [total + per_load * (needed - known) for total, per_load, needed, known in rows]
             self._tip_loads += 1
@@ -396,10 +396,10 @@ class Watch:
             self._test_load(window.end_ns)
 
     def _test_load(self, end_ns: int) -> None:
-        """Raise an alarm if the pose has not moved from the reference pose as the link model predicts."""
-        if self._reference is None or self.load is None or self.alarm is not None or not self._recent:
+        """Raise an alarm if the movement since the earlier load differs from the prediction of the link model."""
+        if self._earlier is None or self.load is None or self.alarm is not None or not self._recent:
             return
-        (pose, deviation), (old_pose, old_deviation) = _median_pose(self._recent), self._reference
+        (pose, deviation), (old_pose, old_deviation) = _median_pose(self._recent), self._earlier
         moved, rotated = math.dist(pose[:2], old_pose[:2]), abs(pose[2] - old_pose[2])
         worst: Alarm | None = None
         worst_ratio = 1.0

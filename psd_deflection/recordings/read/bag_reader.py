@@ -65,8 +65,8 @@ MAX_YAML_BYTES = 16_000_000
 """Largest ``metadata.yaml`` that is read, bytes: the file is untrusted input."""
 
 MAX_PIPELINE_STATES = 4
-"""Recorded pipeline states (``memories``) that are kept: what the processing carries from one block to the next. A
-replay needs only the first one at or after its first block."""
+"""Largest number of pipeline states (``memories``) that is kept. Each is what the processing carries into a block; a
+replay loads one: that of its first block or, without one, of the next block that has one."""
 
 MAX_RESTARTS = 10_000
 """Device restarts that are kept: a bound on memory."""
@@ -151,7 +151,7 @@ class BagRecording(Recording):
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Faults that did not stop the reading, one a line: of the bag, then added by ``warn``, then of each file."""
+        """Faults that did not stop the reading, one a line: of the bag, by ``Recording.warn``, of each file."""
         file_warnings = (line for source in self._sources for line in source.warnings)
         return [*self._bag_warnings.lines(), *self._found.lines(), *file_warnings]
 
@@ -293,8 +293,8 @@ class BagRecording(Recording):
         for log_time, messages in self._message_batches():
             batch = joined_points(messages)
             where = f'{self.path}: {SAMPLES} at log time {log_time} ns'
-            # Where a sample number or a time goes back (wrap, restart), messages are numbered one by one. ``full``: the
-            # numbers were recorded with their high bits.
+            # Where a sample number or a time goes back (wrap, restart), messages are numbered one by one.
+            # ``batch.full``: the recorded numbers have their high bits already.
             is_continuous = numbering.follows(batch.seq, batch.t_ns, batch.full)
             parts = [batch] if is_continuous else [joined_points([message]) for message in messages]
             for part in parts:
@@ -402,7 +402,7 @@ class BagRecording(Recording):
         return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Return unfiltered estimates by topic: the main one without and with covariance, and that of each solver."""
+        """Return unfiltered estimates by topic: the main ones (without or with covariance) and each solver's."""
         rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic
@@ -422,7 +422,7 @@ class BagRecording(Recording):
 
 
 def _to_change(t_ns: int, block: int, json_values: Mapping[str, Any]) -> ParameterChange:
-    """Return the change to ``json_values``. Raises TypeError for a value that is no number, text or list of numbers."""
+    """Return a ParameterChange to ``json_values``. Raises TypeError if one is no number, text or list of numbers."""
     values: list[tuple[str, float | str | tuple[float, ...]]] = []
     for name, value in json_values.items():
         numbers = value if isinstance(value, list) else [value]

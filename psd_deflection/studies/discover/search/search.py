@@ -360,7 +360,7 @@ class Search(Trials):
         return current, alternatives
 
     def with_one_cause(self, current: Fit) -> Fit:
-        """Return ``current``, or a better model with a wrong number of the rig file in place of effects that do the same.
+        """Return ``current``, or a better model with one wrong number of the rig file for effects that do the same.
 
         A length that is wrong changes the stiffness in bending and in torsion as 3 : 1, so beside a third effect the
         search finds two where one number is wrong.
