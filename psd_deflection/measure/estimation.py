@@ -133,7 +133,7 @@ class Estimation:
         self.held: HeldTwist | None = None
         self.systematic: FloatArray | None = None
         self.build(rig, effects)
-        # This must follow build(), so that its solvers reject a geometry that cannot be solved.
+        # After build(): there the solvers reject a geometry that cannot be solved, before BlockEstimator uses it.
         # PSDs on the plate: their noise is measured, and their readings are checked. At the base: neither.
         self.estimator = BlockEstimator(rig, on_plate=not rig.psds_at_base, tilts=solver_class(config.solver).tilts)
 
@@ -416,9 +416,9 @@ class Estimation:
     def _light_errors(self, block: BlockInput) -> tuple[float, FloatArray]:
         """Return the factor on the noise variances, and the variances (2P,), m^2, that background light adds.
 
-        Without a finding in the verdict, the factor is 1 and the variances of sound PSDs are 0.
+        Without a finding (a warning) in the verdict, the factor is 1 and the variances of sound PSDs are 0.
         """
-        # One of two lasers behind a beam splitter is lost: half the light doubles the noise: four times the variance.
+        # One of two lasers of a beam splitter is lost. Half the light doubles the noise: four times its variance.
         factor = 4.0 if block.verdict.half_light else 1.0
         return factor, np.repeat(self._optics.background_variance(block.mean_sums), 2)
 

@@ -12,9 +12,9 @@ an estimate from all PSDs. Three tests compare means over windows, the first and
 
 The first two tests are two-sided CUSUMs (Page, Biometrika 41 (1954) 100) with a dead zone: twice the standard deviation
 of a window's mean or the parameter ``watch_wander``, whichever is larger. After a sum has exceeded ``ALARM_SUM``, the
-alarm waits for ``CONFIRM_S``: people annotate a load after they have applied it; a new load cancels a waiting alarm.
-Without a known load, the alarm does not wait. No test uses a clock or a thread, so the same records cause the same
-alarms, live and in replay.
+alarm is delayed by ``CONFIRM_S`` (3 s): people annotate a load after they have applied it, and a new load cancels a
+waiting alarm. Without a known load, no alarm is delayed. No test uses a clock or a thread, so the same records cause
+the same alarms, live and in replay.
 """
 
 import itertools
@@ -147,7 +147,7 @@ class _Channel:
         self._level_means: list[float] = []  # Bound: LEVEL_WINDOWS.
         self.level: float | None = None
         self._last_mean: float | None = None
-        # CUSUMs of upward and downward shifts; for each, when the window began in which it became positive.
+        # CUSUMs of upward and downward shifts; for each, the start of the window in which it became positive.
         self._sums, self._sums_since_ns = [0.0, 0.0], [0, 0]
         self.shifted, self.since_ns = False, 0
         self._means_since_onset: deque[float] = deque(maxlen=LEVEL_WINDOWS)
@@ -210,7 +210,7 @@ class _Channel:
         return False
 
     def _sd_of_mean(self) -> float:
-        """Return the standard deviation of a window's mean, m: the larger estimate from scatter or successive means."""
+        """Return the standard deviation of a window's mean, m, by scatter or by successive means, the larger."""
         from_scatter = self._usual_scatter / math.sqrt(self._blocks)
         from_steps = 0.0
         if len(self._mean_steps) >= LEVEL_WINDOWS:
@@ -335,7 +335,7 @@ class Watch:
         if self.load is not None and tip_load is not None and tip_load.t_ns == estimate.t_ns:
             # tip_load: the load computed from the estimated pose by the inverse link model.
             rows = zip(self._deviation_sum, self._compliance, tip_load[1:], self.load[1:], strict=True)
-            self._deviation_sum = [total + per_load * (needed - known) for total, per_load, needed, known in rows]
+            self._deviation_sum = [total + per_load * (computed - known) for total, per_load, computed, known in rows]
             self._tip_loads += 1
         self._count += 1
         if self._count == self._blocks:

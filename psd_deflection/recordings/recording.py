@@ -67,7 +67,7 @@ class Recording(abc.ABC):
     ``made_with``: what computed it (:func:`psd_deflection.recordings.provenance.provenance`), {} if it does not say.
     ``node``: full name of the ROS node that recorded itself, or ''.
     ``dropped_here``: samples and messages that it lacks because the machine that recorded did not keep up.
-    ``own``: whether our recorder wrote it, which counts every message that it could not write.
+    ``recorded_by_us``: whether our recorder wrote it, which counts every message that it could not write.
     ``changes``: of parameters during the run, in order. ``memories``: the first few times that the pipeline said all
     that it remembered, each with the block before which that was. ``restarts``: of the device, each as the last sample
     number before and the first after; the numbers between belong to no sample. ``restarts`` and ``warnings``
@@ -86,7 +86,7 @@ class Recording(abc.ABC):
         self.made_with: Mapping[str, str] = {}
         self.node = ''
         self.dropped_here = (0, 0)
-        self.own = False
+        self.recorded_by_us = False
         self.changes: Sequence[ParameterChange] = ()
         self.memories: Sequence[ParameterChange] = ()
         self.restarts: set[tuple[int, int]] = set()
@@ -398,7 +398,7 @@ class RecordingWindow(Recording):
         if self.first_ns >= self.end_ns:
             raise ConfigError(f'{source.path}: from {first} to {last}: must rise')
         self.parameters, self.hello, self.version = source.parameters, source.hello, source.version
-        self.made_with, self.node, self.own = source.made_with, source.node, source.own
+        self.made_with, self.node, self.recorded_by_us = source.made_with, source.node, source.recorded_by_us
         self.changes: Sequence[ParameterChange] = [c for c in source.changes if c.t_ns < self.end_ns]
         self.restarts = source.restarts
         self.temperatures_held = source.temperatures_held

@@ -66,7 +66,7 @@ MAX_YAML_BYTES = 16_000_000
 
 MAX_PIPELINE_STATES = 4
 """Largest number of pipeline states (``memories``) that is kept. Each is what the processing carries into a block; a
-replay loads one: that of its first block or, without one, of the next block that has one."""
+replay loads one: the first recorded at or after its first block."""
 
 MAX_RESTARTS = 10_000
 """Device restarts that are kept: a bound on memory."""
@@ -99,7 +99,7 @@ class BagRecording(Recording):
         self._given_namespace = f'/{stripped}' if stripped else stripped
         metadata = {name: entry for source in self._sources for name, entry in source.metadata.items()}
         software = metadata.get(META_SOFTWARE, {})
-        self.own = META_SOFTWARE in metadata
+        self.recorded_by_us = META_SOFTWARE in metadata
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
         self.dropped_here = _dropped_counts(metadata.get(META_DROPPED, {}))
         self._read_rig()
@@ -151,7 +151,7 @@ class BagRecording(Recording):
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Faults that did not stop the reading, one a line: of the bag, by ``Recording.warn``, of each file."""
+        """Faults that did not stop the reading, one a line: the bag's, those of ``Recording.warn``, each file's."""
         file_warnings = (line for source in self._sources for line in source.warnings)
         return [*self._bag_warnings.lines(), *self._found.lines(), *file_warnings]
 
@@ -191,7 +191,9 @@ class BagRecording(Recording):
                 name: value for name, value in rig_state.changed.items() if name in expected_parameters
             }
             if expected_parameters != rig_state.parameters and change not in changes:
-                self._add_warning(f'another rig starts at log time {log_time} ns; the first one is taken for all')
+                self._add_warning(
+                    f'another rig starts at log time {log_time} ns; the first rig is taken for the whole recording'
+                )
             if change.values:
                 changes[change] = None
             if pipeline_state is not None and len(self.memories) < MAX_PIPELINE_STATES:
@@ -205,7 +207,7 @@ class BagRecording(Recording):
                 yield from source.messages(topics)
             return
         without_namespace = self._without_namespace
-        recorded_topics = {name for name, topic in without_namespace.items() if topics is None or topic in topics}
+        recorded_topics = {recorded for recorded, name in without_namespace.items() if topics is None or name in topics}
         for source in self._sources:
             for channel, log_time, message in source.messages(recorded_topics):
                 yield RawMessage(channel._replace(topic=without_namespace[channel.topic]), log_time, message)
@@ -232,7 +234,7 @@ class BagRecording(Recording):
         return sample_topics[0].removesuffix(SAMPLES) if sample_topics else ''
 
     def _known_topics(self) -> set[str]:
-        """Return the topics known so far, with namespace: all topics once each file is complete or read to its end."""
+        """Return the topics known so far, with namespace; those of a damaged file are all known once it is read."""
         return {channel.topic for source in self._sources for channel in source.channels}
 
     def _first_message_on(self, recorded_topic: str) -> RawMessage | None:
@@ -253,7 +255,7 @@ class BagRecording(Recording):
     def _without_namespace(self) -> dict[str, str]:
         """Map each recorded topic to its name without the namespace; topics outside it only if the bag has one rig."""
         if not self.complete:
-            # Only a full pass shows all topics of a damaged file. The topic '' never occurs: the search is such a pass.
+            # Only a full pass shows all topics of a damaged file. Searching for '' reads all: it never occurs.
             self._first_message_on('')
         recorded_topics = self._known_topics()
         prefix = f'{self.namespace}/'

@@ -67,7 +67,7 @@ class ReplayComparison:
         # Last stamp of each topic before that.
         self._before: dict[str, int] = {}
         # A recorder of ours writes every message, or counts it; another one may lose some on the way.
-        self._gapless = recording.own
+        self._gapless = recording.recorded_by_us
         self._between: dict[str, int] = {}
         self._recording = recording
         self._frame_prefix = str(recording.parameters.get(FRAME_PREFIX, ''))

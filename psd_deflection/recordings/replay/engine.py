@@ -256,7 +256,7 @@ def _with_memory(recording: Recording, first: int, changes: list[ParameterChange
     if memory is not None:
         before = [change for change in changes if change.block < memory.block]
         return [*before, memory, *changes[len(before) :]]
-    reported = () if recording.own else (*recording.memories[:1], *recording.changes[:1])
+    reported = () if recording.recorded_by_us else (*recording.memories[:1], *recording.changes[:1])
     if any(0 < one.block < first for one in reported):
         recording.warn(
             f'{recording.path}: starts in mid-run, and ends before the pipeline said what it remembers (it does every '

@@ -20,6 +20,7 @@ from psd_deflection.base.tables import Column, Table, text_column
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
@@ -288,7 +289,10 @@ class RigConclusion(Conclusion):
         """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
         missing = _missing(self, ' besides' if self.setup else '')
         tied = [t.sentence for t in ties(self.effects)]
-        return [s for s in (_setup(self), missing, *tied, _moved(self), law_sentence(self), *self.beyond) if s]
+        annotated = _as_annotated(self)
+        return [
+            s for s in (_setup(self), missing, *tied, annotated, _moved(self), law_sentence(self), *self.beyond) if s
+        ]
 
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
@@ -420,6 +424,28 @@ def _seconds(finding: Finding) -> str:
         return ''
     direction = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
     return f'{abs(finding.value):.3g} s{direction}'
+
+
+STATIC = ('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance')
+"""Effects that change how far a load moves the link at rest; stiffnesses with ``moves_frequency`` its ringing, too."""
+LEAST_FACTOR = 1e-3
+"""A load is as noted if it is so by this share."""
+
+
+def _as_annotated(discovery: RigConclusion) -> str:
+    """Return what wrong loads would do as the only effects do, in a sentence; nothing if they cannot."""
+    effects = [e.active for e in discovery.effects]
+    if not effects or any(a.effect.name not in STATIC or a.values.get('moves_frequency') for a in effects):
+        return ''
+    known, now = (ForwardModel(discovery.rig, [*discovery.known, *more]).physics for more in ((), effects))
+    factors = {
+        'forces': now.force_compliance / known.force_compliance,
+        'torques': now.torque_compliance / known.torque_compliance,
+    }
+    wrong = [f'{name} {v:.4g} times the noted ones' for name, v in factors.items() if abs(v - 1.0) > LEAST_FACTOR]
+    which = {'forces': 'the scale', 'torques': 'the arm'}
+    check = ' and '.join(which[w.split()[0]] for w in wrong)
+    return f'{" and ".join(wrong).capitalize()} would do the same: check {check}.' if wrong else ''
 
 
 def _moved(discovery: RigConclusion) -> str:

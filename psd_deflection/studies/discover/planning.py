@@ -5,6 +5,7 @@ rivals, averaged over all pairs and counted up to ``SURE``; with less effort at 
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,10 +52,11 @@ class Suggestion:
         """The suggestion as text, for people and result.json."""
         if self.separation < SEPARATES:
             return (
-                f'none of the experiments tried tells them apart; the best, {self.words}, separates by chi-square '
-                f'{self.separation:.1f} (needed: {SEPARATES})'
+                f'none of the experiments tried tells them apart; the best, {self.words}, separates them by '
+                f'{math.sqrt(self.separation):.1f} standard deviations (needed: {math.sqrt(SEPARATES):.1f})'
             )
-        return f'{self.words}: in simulation this separates them by chi-square {self.separation:.0f}'
+        apart = f'{math.sqrt(self.separation):.2g}'
+        return f'{self.words}: in simulation this separates them by {float(apart):g} standard deviations'
 
 
 @dataclass(frozen=True, slots=True, eq=False)

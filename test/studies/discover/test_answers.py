@@ -411,7 +411,7 @@ def test_a_plan_says_what_it_separates() -> None:
     }
     assert (tree['useful'], tree['loads'], tree['limits']['seconds']) == (True, plan.script, 30.0)
     assert [reported_of('x', 0.0, 0.0, p).separable for p in (21.5, 21.6)] == [False, True]
-    assert Suggestion('do', 21.7).text == 'do: in simulation this separates them by chi-square 22'
+    assert Suggestion('do', 21.7).text == 'do: in simulation this separates them by 4.7 standard deviations'
     assert planning.rate_of(RIG, Setting('', {'converter.sample_rate_hz': 250.0})) == 250.0
     assert planning.rate_of(RIG, Setting()) == 1000.0
 
@@ -656,6 +656,21 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery
     assert description_of(soft, lag) == not_corrected
     assert description_of(rotated, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
     assert description_of(rotated, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
+
+
+def test_wrong_notes_that_do_the_same_are_named(found: Discovery) -> None:
+    soft, twists = (named_as(f'{way}_stiffness', scale=-0.2, moves_frequency=0.0) for way in ('bending', 'torsional'))
+    rings = named_as('torsional_stiffness', scale=-0.2, moves_frequency=1.0)
+    same = 'times the noted ones would do the same: check'
+    for effects, words in (
+        ([soft], f'Forces 1.25 {same} the scale.'),
+        ([twists], f'Torques 1.25 {same} the arm.'),
+        ([soft, twists], f'Forces 1.25 times the noted ones and torques 1.25 {same} the scale and the arm.'),
+        ([rings], ''),
+        ([soft, found.effects[0]], ''),
+    ):
+        sentences = dataclasses.replace(found, effects=tuple(effects)).sentences()
+        assert [s for s in sentences if same in s] == ([words] if words else [])
 
 
 def test_places_are_reported_if_one_in_twenty_by_chance(found: Discovery) -> None:
