@@ -113,7 +113,7 @@ def test_the_xacro_macro_hangs_the_link_on_a_robot(tmp_path: Path) -> None:
     joint = urdf.find('joint')
     assert joint is not None
     assert [(e.tag, *e.attrib.values()) for e in joint] == [
-        *(('parent', 'tool0'), ('child', f'left_{BASE}'), ('origin', '0 0 0.1')),
+        *(('parent', 'tool0'), ('child', f'left_{BASE}'), ('origin', '0 0 0.1'))
     ]
     assert urdf.findall(f"link[@name='left_{BASE}']/visual/origin")[0].get('xyz') == '0 0 0.4'
 

@@ -18,14 +18,7 @@ from psd_deflection.recordings.read import csv_reader
 from psd_deflection.recordings.read.csv_reader import CsvRecording, SampleRows
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink, seconds
-from psd_deflection.records import (
-    AppliedLoad,
-    Record,
-    ReferencePose,
-    SampleBlock,
-    TemperatureReading,
-    TipLoad,
-)
+from psd_deflection.records import AppliedLoad, Record, ReferencePose, SampleBlock, TemperatureReading, TipLoad
 
 from .making import STEP, T0, block, estimate
 

@@ -152,7 +152,7 @@ def test_push_rows_list_expected_channels_of_rig_file() -> None:
     assert [len(row) for row in push_rows(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
     assert CHECKUP.lines()[1].split() == [
-        *('push', 'x1', 'µm', 'y1', 'µm', 'x2', 'µm', 'y2', 'µm', 'x1', 'y1', 'x2', 'y2', 'size'),
+        *('push', 'x1', 'µm', 'y1', 'µm', 'x2', 'µm', 'y2', 'µm', 'x1', 'y1', 'x2', 'y2', 'size')
     ]
 
 
