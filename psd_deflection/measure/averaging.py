@@ -97,8 +97,8 @@ def middles_ns(seq: IntArray, t_ns: IntArray, block_size: int, period_ns: float)
 
 Volts = npt.NDArray[np.float32]
 
-AT_ONCE = 50
-"""Blocks that are computed together, at the most: those of one segment of the noise, which changes after it."""
+SEGMENT_BLOCKS = 50
+"""Blocks of a segment of the noise, a second at 50 blocks a second: at most so many are computed together."""
 
 _THIRD_DIFFERENCE = 20.0
 """Variance of the third difference of white noise of variance 1: 1 + 9 + 9 + 1."""
@@ -130,7 +130,7 @@ class BlockMeasures(NamedTuple):
 
 def of_one_length(blocks: Sequence[SampleBlock]) -> Iterator[list[SampleBlock]]:
     """The blocks in turn, those of one length and segment that follow each other together."""
-    for _, same in itertools.groupby(blocks, key=lambda block: (len(block.seq), block.index // AT_ONCE)):
+    for _, same in itertools.groupby(blocks, key=lambda block: (len(block.seq), block.index // SEGMENT_BLOCKS)):
         yield list(same)
 
 

@@ -173,12 +173,12 @@ class Pipeline:
     def process_blocks(self, blocks: Sequence[SampleBlock]) -> Iterator[Record]:
         """The records of whole blocks of this rig in turn, as :meth:`process` has them."""
         for together in of_one_length(blocks):
-            yield from self._together(together)
+            yield from self._alike(together)
 
     def flush(self) -> Iterator[Record]:
         """The records of the unfinished block; call it when the stream ended or restarts."""
         for block in self._cutter.flush():
-            yield from self._together([block])
+            yield from self._alike([block])
 
     def zero(self, late_s: float = 0.0) -> ParameterChange | None:
         """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
@@ -344,7 +344,7 @@ class Pipeline:
             return samples
         return self._corrected(block, samples, volts[:, 2::3].astype(np.float64))
 
-    def _together(self, blocks: Sequence[SampleBlock]) -> Iterator[Record]:
+    def _alike(self, blocks: Sequence[SampleBlock]) -> Iterator[Record]:
         """The records of ``blocks`` of one length; what changes in between holds from the next block on."""
         while blocks:
             first = blocks[0]

@@ -64,7 +64,7 @@ CONFIRM_S = 3.0
 LEVEL_GAIN = 1.0 / 120.0
 """Weight of a new window in the level while both sums are 0: the level follows drift with a time constant of 60 s."""
 BASE_LINE_FRACTION = 0.002
-"""Fraction of the tip's movement that is added to ``watch_wander`` for base lines, as in ``discover``."""
+"""Tolerance of base lines per movement of the tip, for errors of gains and angles, added to ``watch_wander``."""
 POSE_TOLERANCES = {'dx': 5e-6, 'dy': 5e-6, 'theta': 40e-6}
 """Permitted error of the link model at zero movement: m, m, rad."""
 POSE_FRACTION = 0.02
@@ -210,7 +210,7 @@ class _Channel:
         return False
 
     def _sd_of_mean(self) -> float:
-        """Return the standard deviation of a window's mean, m, by scatter or by successive means, the larger."""
+        """Return the standard deviation of a window's mean, m: the larger of those by scatter and by steps."""
         from_scatter = self._usual_scatter / math.sqrt(self._blocks)
         from_steps = 0.0
         if len(self._mean_steps) >= LEVEL_WINDOWS:

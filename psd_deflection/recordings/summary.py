@@ -10,8 +10,8 @@ import numpy as np
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.uncertainty.combinations import combinations_of
-from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS
 from psd_deflection.measure.uncertainty.vibration import FOLLOWED, Tone, ToneSearch, rms_of
 from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.recordings.recording import Recording

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.measure.averaging import AT_ONCE, BlockCutter, measured, middles_ns, of_one_length
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS, BlockCutter, measured, middles_ns, of_one_length
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_start
@@ -211,5 +211,5 @@ def test_blocks_of_one_length_and_one_segment_go_together() -> None:
     recording = open_recording(BAGS / 'lost_samples')
     together = list(of_one_length(list(recording.blocks())))
     assert [len(b) for b in together][:4] == [2, 1, 7, 1]
-    assert max(map(len, together)) <= AT_ONCE
-    assert all(len({(len(b.seq), b.index // AT_ONCE) for b in run}) == 1 for run in together)
+    assert max(map(len, together)) <= SEGMENT_BLOCKS
+    assert all(len({(len(b.seq), b.index // SEGMENT_BLOCKS) for b in run}) == 1 for run in together)

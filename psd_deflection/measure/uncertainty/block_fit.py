@@ -271,11 +271,11 @@ class BlockFit:
         runs: list[FittedRun] = []
         memory = self.memory if memory is None else memory
         for at in range(0, len(dots), most):
-            runs.append(self._together(terms, slots, dots[at : at + most], memory))
+            runs.append(self._run(terms, slots, dots[at : at + most], memory))
             memory = runs[-1].memories[-1]
         return runs
 
-    def _together(self, terms: _Terms, slots: IntArray, dots: FloatArray, memory: MotionMemory) -> FittedRun:
+    def _run(self, terms: _Terms, slots: IntArray, dots: FloatArray, memory: MotionMemory) -> FittedRun:
         """The fits of blocks of which none has a sum over more than ``AT_ONCE`` numbers."""
         xp, count = self._xp, self._count
         blocks, samples, _ = dots.shape

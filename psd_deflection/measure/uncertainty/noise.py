@@ -31,13 +31,11 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.matrices import inverse
 from psd_deflection.base.arithmetic.spectra import lagged_products
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis
 from psd_deflection.measure.uncertainty.combinations import Residual, combinations_of
 from psd_deflection.measure.uncertainty.vibration import Hum, Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray
-
-SEGMENT_BLOCKS = 50
-"""Blocks of one segment: a second at 50 blocks a second."""
 
 _FAR = 5
 """Blocks over whose means what is slow is measured."""

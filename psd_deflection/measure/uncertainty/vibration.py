@@ -164,13 +164,13 @@ class ToneSearch:
             if bool((shown & (self._xp.sum(power[near, count:], 0) > _ELECTRIC * moved.max())).any()):
                 hum.append(frequency)
                 continue
-            covariance = scale * self._together(spectrum[None, band, :count] * observed[:count])[0]
+            covariance = scale * self._cross_spectrum(spectrum[None, band, :count] * observed[:count])[0]
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
         # What the tones have is theirs already.
         for band in self._broad(every * free[:, None], readings, known):
             # The quietest group has the noise alone, or hardly more.
             noise = np.median(self._grouped(power[:, :count]), axis=1).min(axis=0) / _LN_2
-            covariance = self._together(spectrum[None, band, :count] * free[band, None])[0]
+            covariance = self._cross_spectrum(spectrum[None, band, :count] * free[band, None])[0]
             covariance[range(count), range(count)] -= np.count_nonzero(free[band]) * noise
             frequency = 0.5 * (band.start + band.stop - 1) / self._length
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, scale * covariance, turn)))
@@ -180,7 +180,7 @@ class ToneSearch:
         """``values`` (F, k) as (groups, bins, k)."""
         return values[self._start : self._start + self._groups * _GROUP].reshape(self._groups, _GROUP, -1)
 
-    def _together(self, spectra: npt.NDArray[np.complex128]) -> FloatArray:
+    def _cross_spectrum(self, spectra: npt.NDArray[np.complex128]) -> FloatArray:
         """(g, k, k): how k ``spectra`` (g, bins, k) vary together in each of g groups of bins."""
         cross = self._xp.times_conjugate(spectra[:, :, :, None], spectra[:, :, None, :]).real
         return self._xp.sum(np.ascontiguousarray(cross.swapaxes(0, 1)), 0)
@@ -191,7 +191,7 @@ class ToneSearch:
         ``every``: the spectra, those of ``readings`` first. What falls from one group to the next is the flank of
         slower motion.
         """
-        cross = self._together(self._grouped(every))
+        cross = self._cross_spectrum(self._grouped(every))
         own = np.sqrt(np.diagonal(cross, axis1=1, axis2=2)) + _LEAST
         alike = np.abs(cross) / (own[:, :, None] * own[:, None, :])
         level, psd = self._xp.sum(np.square(own[:, :readings]), 1), np.arange(readings) // 2

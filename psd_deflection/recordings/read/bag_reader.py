@@ -65,8 +65,8 @@ MAX_YAML_BYTES = 16_000_000
 """Largest ``metadata.yaml`` that is read, bytes: the file is untrusted input."""
 
 MAX_PIPELINE_STATES = 4
-"""Largest number of pipeline states (``memories``) that is kept. Each is what the processing carries into a block; a
-replay loads one: the first recorded at or after its first block."""
+"""Largest number of pipeline states (``memories``) that is kept. Each is what the processing carries into a block. A
+replay from block n on loads the first state whose block is n or later."""
 
 MAX_RESTARTS = 10_000
 """Device restarts that are kept: a bound on memory."""
@@ -234,7 +234,7 @@ class BagRecording(Recording):
         return sample_topics[0].removesuffix(SAMPLES) if sample_topics else ''
 
     def _known_topics(self) -> set[str]:
-        """Return the topics known so far, with namespace; those of a damaged file are all known once it is read."""
+        """Return the topics known so far, with namespace; for a damaged file, all only after a full pass."""
         return {channel.topic for source in self._sources for channel in source.channels}
 
     def _first_message_on(self, recorded_topic: str) -> RawMessage | None:
@@ -253,9 +253,9 @@ class BagRecording(Recording):
 
     @functools.cached_property
     def _without_namespace(self) -> dict[str, str]:
-        """Map each recorded topic to its name without the namespace; topics outside it only if the bag has one rig."""
+        """Map each recorded topic to its name without the namespace; of one rig also those outside it."""
         if not self.complete:
-            # Only a full pass shows all topics of a damaged file. Searching for '' reads all: it never occurs.
+            # Only a full pass shows all topics of a damaged file. None is named '': the search for it is one.
             self._first_message_on('')
         recorded_topics = self._known_topics()
         prefix = f'{self.namespace}/'
@@ -335,7 +335,7 @@ class BagRecording(Recording):
                 self._clock_leap_reported = True
                 self._add_warning(
                     f"the recorder's clock leapt by {leap_ns / 1e9:+.3f} s at log time {log_time} ns; "
-                    'samples keep their own times; marks and inputs without a stamp are shifted by the leap'
+                    'samples keep their times; marks and inputs without a stamp have log times, off by the leap'
                 )
             if batch and (len(batch) == _BATCH_MESSAGES or points.dtype != batch[0][1].dtype):
                 yield first_log_time, batch
@@ -404,7 +404,7 @@ class BagRecording(Recording):
         return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Return unfiltered estimates by topic: the main ones (without or with covariance) and each solver's."""
+        """Return unfiltered estimates of the topics ``/link_tip/.../deflection`` and of that with covariance."""
         rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic

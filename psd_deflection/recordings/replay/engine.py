@@ -13,7 +13,7 @@ import numpy as np
 from msg_adapters import DEFLECTION
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import Note
-from psd_deflection.measure.averaging import AT_ONCE
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.estimation import ZERO_VARIANCES
 from psd_deflection.measure.pipeline import Pipeline, zero_variances
 from psd_deflection.measure.watch import Alarm, Watch
@@ -161,7 +161,7 @@ def _steps(
             yield from beside.until(block)
         waiting.append(block)
         ended = block.t_ns[0] >= end_ns
-        if ended or block.index % AT_ONCE == AT_ONCE - 1 or len(waiting) == AT_ONCE:
+        if ended or block.index % SEGMENT_BLOCKS == SEGMENT_BLOCKS - 1 or len(waiting) == SEGMENT_BLOCKS:
             yield from _processed(pipeline, waiting)
         if ended:
             # The blocks of the part are complete, as they were in the run.

@@ -9,11 +9,12 @@ import numpy.typing as npt
 import pytest
 
 from blind.coverage import Row, coarse, louder, motion, volts_of
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_estimator import ConverterSteps
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
 from psd_deflection.measure.uncertainty.combinations import combinations_of
-from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise, undithered
+from psd_deflection.measure.uncertainty.noise import StreamNoise, undithered
 from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk
 from psd_deflection.rig.config import load_rig
 from test import streams

@@ -11,10 +11,11 @@ import pytest
 from blind import generator
 from blind.coverage import ROWS, Row, motion, rig, score, shaken, volts_of
 from psd_deflection.cli.main import main
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_estimator import VIBRATION
 from psd_deflection.measure.uncertainty.block_fit import BlockFit
-from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
+from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.vibration import Tone, Tones, ToneSearch, rms_of, words_of
 from psd_deflection.records import FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
 from psd_deflection.rig.config import Rig, load_rig
