@@ -27,7 +27,7 @@ class BlockCutter:
         self._pending: list[SampleBlock] = []  # Bound: one block.
 
     def add(self, chunk: RawChunk, volts: np.ndarray[tuple[int, int], np.dtype[np.float32]]) -> list[SampleBlock]:
-        """The blocks that ``chunk`` completes. ``volts`` float32 (n, 6): its readings in volts."""
+        """The blocks that ``chunk`` completes. ``volts`` float32 (n, 3P): its readings in volts."""
         seq, t_ns, flags = chunk.seq, chunk.t_ns, chunk.flags
         n = len(seq)
         if n == 0:

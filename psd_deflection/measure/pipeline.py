@@ -361,6 +361,7 @@ class Pipeline:
                 yield from self._block(*own)
                 done += 1
                 if self._changes != changes:
+                    # The others were fitted with what no longer holds.
                     break
             blocks = blocks[done:]
 
@@ -379,8 +380,10 @@ class Pipeline:
         status, reason = answer.failure or (verdict.status, verdict.reason)
         self._count(status, verdict, answer)
         yield from self._estimates(observed, answer, status)
-        # The estimates are out: the rest is not urgent.
-        findings = self._findings(measures, observed, answer, status)
+        # The estimates are out: the rest is not urgent. What this block teaches applies from the next one on.
+        if status is BlockStatus.OK and not verdict.findings and not (answer.solved and answer.solved.excluded_psd):
+            self._learn(observed, measures)
+        findings = self._findings(measures, observed, answer)
         self.last_spots = SpotMeans(
             t_ns=observed.t_ns,
             index=observed.index,
@@ -459,22 +462,16 @@ class Pipeline:
             self._recent.clear()
         self._recent.append((observed.t_ns, answer.solved.readings.dots))
 
-    def _findings(
-        self, measures: BlockMeasures, observed: BlockInput, answer: BlockSolution, status: BlockStatus
-    ) -> tuple[str, ...]:
-        """Return the findings of a block; from a good block without any, the noise is learnt."""
+    def _findings(self, measures: BlockMeasures, observed: BlockInput, answer: BlockSolution) -> tuple[str, ...]:
+        """Return the findings of a block, and count them."""
         findings, solved = observed.verdict.findings, answer.solved
         if solved is not None and solved.excluded_psd:
             findings = (*findings, f'psd_{solved.excluded_psd} contradicts the others and is left out')
-        # Before learning: what this block teaches applies from the next one on.
-        vibrates = self.estimator.vibrates
-        if status is BlockStatus.OK and not findings:
-            self._learn(observed, measures)
         if answer.complete and solved is not None and solved.check_result is not None:
             self.estimator.search_outliers(observed.index, solved.readings.dots, solved.check_result)
         findings += self._optics.late_findings(measures, observed.verdict, observed.frozen, self._loudness)
-        if vibrates:
-            findings += (f'vibrates: {vibrates}',)
+        if self.estimator.vibrating:
+            findings += (f'vibrates: {self.estimator.vibrates}',)
         if answer.estimate is not None:
             findings += self._calibrated.findings(answer.estimate.pose)
         self.counters.count_findings(findings)

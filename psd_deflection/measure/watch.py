@@ -210,7 +210,7 @@ class _Channel:
         return False
 
     def _sd_of_mean(self) -> float:
-        """Return the standard deviation of a window's mean, m: the larger of those by scatter and by steps."""
+        """Return the standard deviation of a window's mean, m: the larger of two estimates, by scatter and by steps."""
         from_scatter = self._usual_scatter / math.sqrt(self._blocks)
         from_steps = 0.0
         if len(self._mean_steps) >= LEVEL_WINDOWS:

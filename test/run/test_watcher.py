@@ -163,7 +163,6 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_a_disk_without_room_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage
-    # As the system has it: of a folder that does not exist there is no figure.
     monkeypatch.setattr(shutil, 'disk_usage', lambda path: usage(path)._replace(free=1_000_000))
     chain = Chain(tmp_path)
     chain.bump()

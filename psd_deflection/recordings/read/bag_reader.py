@@ -65,8 +65,8 @@ MAX_YAML_BYTES = 16_000_000
 """Largest ``metadata.yaml`` that is read, bytes: the file is untrusted input."""
 
 MAX_PIPELINE_STATES = 4
-"""Largest number of pipeline states (``memories``) that is kept. Each is what the processing carries into a block. A
-replay from block n on loads the first state whose block is n or later."""
+"""Largest number of pipeline states (``memories``) that is kept. Each is the state of the processing just before a
+block. A replay from block n on loads the first one saved for block n or later, when it comes to that block."""
 
 MAX_RESTARTS = 10_000
 """Device restarts that are kept: a bound on memory."""
@@ -234,7 +234,7 @@ class BagRecording(Recording):
         return sample_topics[0].removesuffix(SAMPLES) if sample_topics else ''
 
     def _known_topics(self) -> set[str]:
-        """Return the topics known so far, with namespace; for a damaged file, all only after a full pass."""
+        """Return the topics known so far, with namespace; those of a damaged file are complete after a full pass."""
         return {channel.topic for source in self._sources for channel in source.channels}
 
     def _first_message_on(self, recorded_topic: str) -> RawMessage | None:
@@ -253,9 +253,9 @@ class BagRecording(Recording):
 
     @functools.cached_property
     def _without_namespace(self) -> dict[str, str]:
-        """Map each recorded topic to its name without the namespace; of one rig also those outside it."""
+        """Map each recorded topic to its name without the namespace; if the bag has one rig, also topics outside it."""
         if not self.complete:
-            # Only a full pass shows all topics of a damaged file. None is named '': the search for it is one.
+            # Only a full pass shows all topics of a damaged file. No topic is named '': the search reads all.
             self._first_message_on('')
         recorded_topics = self._known_topics()
         prefix = f'{self.namespace}/'
@@ -404,7 +404,7 @@ class BagRecording(Recording):
         return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Return unfiltered estimates of the topics ``/link_tip/.../deflection`` and of that with covariance."""
+        """Return unfiltered estimates by topic, ``/link_tip/.../deflection`` and that of the one with covariance."""
         rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic

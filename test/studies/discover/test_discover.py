@@ -123,6 +123,12 @@ def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
 
 
 @pytest.mark.slow
+def test_what_one_load_shows_is_unknown_on_unseen_loads() -> None:
+    found = discover([observe(with_effect('amplifier_saturation', limit=8.48, sums=0))], RIG, bank=BANK)
+    assert (found.gap_heldout_after, found.gap_after) == pytest.approx((found.gap_before, found.gap_floor), rel=0.02)
+
+
+@pytest.mark.slow
 def test_a_parameter_stays_where_the_rig_lets_it() -> None:
     workspace = Workspace([observe(RIG)])
     ambient = make_active('ambient_light', {'psd': 2, 'level': 0.01, 'x': 0.4, 'y': 0.0}, 'test')

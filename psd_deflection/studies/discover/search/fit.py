@@ -225,8 +225,25 @@ def heldout_residual(workspace: Comparison, fit: Fit, home: bool = True) -> Floa
     if not fit.free:
         return fit.residual
     out = fit.residual.copy()
+    removed = _removed(workspace, fit) if home else {}
     for test, step in fold_steps(workspace, fit, home):
-        out[test] -= fit.jacobian[test] @ step
+        moved = fit.jacobian[test] * step
+        for columns, without in removed.items():
+            # A limit that goes back to where it clips nothing moves the residual by no more than that.
+            most = fit.residual[test] - without[test]
+            if np.linalg.norm(moved[:, columns].sum(axis=1)) > np.linalg.norm(most):
+                moved[:, columns] = most[:, None] / len(columns)
+        out[test] -= moved.sum(axis=1)
+    return out
+
+
+def _removed(workspace: Comparison, fit: Fit) -> dict[tuple[int, ...], FloatArray]:
+    """Return the whitened residual (D,) without each effect that is not in proportion to its size, by its columns."""
+    out = {}
+    for i, active in enumerate(fit.effects):
+        if active.effect.finite and (columns := tuple(fit.columns_of(i))):
+            rest = [a for k, a in enumerate(fit.effects) if k != i]
+            out[columns] = workspace.residual([*workspace.base, *fit.nuisance, *rest])[0]
     return out
 
 
