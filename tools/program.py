@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 import pty
+import random
 import re
 import shutil
 import signal
@@ -36,8 +37,9 @@ def copy_checkout(target: Path, *words: str) -> Path:
 @contextlib.contextmanager
 def ros_domain() -> Iterator[int]:
     """A ROS_DOMAIN_ID that nobody else has, held by a lock. RuntimeError if none is free."""
-    # Each domain takes ports of its own; those above 99 are in the range that systems use for others.
-    for candidate in range(99, 19, -1):
+    # Each domain takes ports of its own; those above 99 are in the range that systems use for others. In any order: a
+    # container beside us has its own locks and the same network.
+    for candidate in random.sample(range(20, 100), 80):
         with (Path(tempfile.gettempdir()) / f'psd_deflection_test_domain_{candidate}').open('w') as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -11,6 +11,7 @@ from pathlib import PurePath
 from typing import BinaryIO, NamedTuple
 
 from psd_deflection.base.text import did_you_mean, sanitize
+from psd_deflection.records import MOST_PSDS
 
 OUT = 'OUT.csv'
 LONGEST_HEADER = 120
@@ -25,6 +26,7 @@ _PIECE = 1 << 20
 SYNONYMS = {
     't': ('time', 'timestamp', 'times', 'seconds', 'sec', 'elapsed', 'elapsedtime', 'zeit', 'xvalue', 'datetime'),
     'temperature': ('temp', 'tempc', 'celsius'),
+    **{f'sum{n}': (f's{n}', f'sigma{n}', f'i{n}', f'intensity{n}', f'total{n}') for n in range(1, MOST_PSDS + 1)},
 }
 UNITS = {
     'ns': 'nanoseconds: divide by 1e9',
@@ -226,9 +228,12 @@ def what_of_header(
     if len(guesses) == len(lacking):
         ours = {m.found: m.ours for m in guesses}
         header = ','.join(ours.get(name, name) for name in names)
+        scaled = [(names.index(m.found), m.unit.rpartition(' ')[2]) for m in guesses if m.unit]
         if re.fullmatch(r'[\w., -]+', header):
-            line = shell_line(path, [f"sed '1s/.*/{header}/'"])
-            words += f' `{line}` renames them'
+            cells = ''.join(f' ${i + 1} = sprintf("%.9f", ${i + 1} / {by});' for i, by in scaled)
+            awk = f'awk -F, -v OFS=, \'NR == 1 {{$0 = "{header}"}} NR > 1 && NF {{{cells.strip()}}} 1\''
+            line = shell_line(path, [awk if scaled else f"sed '1s/.*/{header}/'"])
+            words += f' `{line}` renames them{" and changes their units" if scaled else ""}'
     return f'{words}; {form}'
 
 

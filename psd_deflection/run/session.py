@@ -102,7 +102,9 @@ class Session:
             )
         same = left_as_in_the_thesis(rig.values)
         if same:
-            more = f' and {len(same) - 1} more (`psd-deflection params` lists them)' if len(same) > 1 else ''
+            more = (
+                f' and {len(same) - 1} more (`psd-deflection info` of a recording lists them)' if len(same) > 1 else ''
+            )
             log(f'as in the thesis rig, unless you measured the same: {same[0]}{more}')
         try:
             self.acquisition = Acquisition(rig, log)

@@ -131,7 +131,7 @@ CONVERTIBLE: dict[str, tuple[bytes, tuple[str, ...]]] = {
     'bars': (table(separator='|').encode(), ('cells between bars',)),
     'wraps': (counter(US - 300_000), (':32: ', 'a 32-bit counter of µs began again')),
     'signed': (counter(US // 2 - 300_000, signed=True), (':32: ', 'a 32-bit counter of µs began again')),
-    't_us_wraps': (counter(US - 300_000, raw=True), ('t for t_us', 'µs of a 32-bit counter', 'µs began again')),
+    't_us_wraps': (counter(US - 300_000, raw=True), ('t for t_us', 'changes their units', 'µs began again')),
     't_us_signed': (
         counter(US // 2 - 300_000, signed=True, raw=True),
         ('t for t_us', 'µs began again', 'microseconds'),

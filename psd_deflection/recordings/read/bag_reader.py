@@ -66,7 +66,7 @@ MAX_YAML_BYTES = 16_000_000
 
 MAX_PIPELINE_STATES = 4
 """Largest number of pipeline states (``memories``) that is kept. Each is the state of the processing just before a
-block. A replay from block n on loads the first one saved for block n or later, when it comes to that block."""
+block. A replay that starts at block n loads the first state whose block is n or later, on reaching that block."""
 
 MAX_RESTARTS = 10_000
 """Device restarts that are kept: a bound on memory."""
@@ -167,7 +167,7 @@ class BagRecording(Recording):
         """Read parameters, versions, ``hello`` (device description), changes and pipeline states from topic ``RIG``."""
         # The keys are an ordered set: a node may send the same change again.
         changes: dict[ParameterChange, None] = {}
-        # What the next message must have: the first recorded parameters with all changes so far.
+        # What each message must have: the first recorded parameters with all changes up to and including its own.
         expected_parameters: dict[str, object] = {}
         for channel, log_time, message in self.messages([RIG]):
             if channel.type != TOPIC_TYPES[RIG] or channel.encoding != 'cdr':
@@ -190,6 +190,7 @@ class BagRecording(Recording):
             expected_parameters |= {
                 name: value for name, value in rig_state.changed.items() if name in expected_parameters
             }
+            # A change that was sent again may differ from what is expected by now: it is no other rig.
             if expected_parameters != rig_state.parameters and change not in changes:
                 self._add_warning(
                     f'another rig starts at log time {log_time} ns; the first rig is taken for the whole recording'
@@ -253,7 +254,10 @@ class BagRecording(Recording):
 
     @functools.cached_property
     def _without_namespace(self) -> dict[str, str]:
-        """Map each recorded topic to its name without the namespace; if the bag has one rig, also topics outside it."""
+        """Map each recorded topic to its name without the namespace.
+
+        If the bag has only one rig, topics outside the namespace keep their names.
+        """
         if not self.complete:
             # Only a full pass shows all topics of a damaged file. No topic is named '': the search reads all.
             self._first_message_on('')
@@ -404,7 +408,10 @@ class BagRecording(Recording):
         return self._records_on(TEMPERATURE, temperature.to_reading)
 
     def estimates(self) -> dict[str, EstimateSeries]:
-        """Return unfiltered estimates by topic, ``/link_tip/.../deflection`` and that of the one with covariance."""
+        """Return the unfiltered estimates by topic.
+
+        The topics are ``/link_tip/.../deflection`` and ``/link_tip/deflection_with_covariance``.
+        """
         rows_by_topic: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         for channel, log_time, message in self.messages():
             topic = channel.topic
