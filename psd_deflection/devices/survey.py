@@ -24,6 +24,7 @@ ONCE_A_SECOND_S = 1.3
 BOOT_S = 3.5
 """An Arduino restarts when its port is opened."""
 
+PSEUDO_TERMINALS = Path('/dev/pts')
 BY_ID = Path('/dev/serial/by-id')
 
 
@@ -73,7 +74,8 @@ class _ProtocolProbes:
         if answer.usable:
             self._port.source = name
             suggested = {'source': name, 'port': stable_name(self._port.port), **answer.parameters}
-            if not has_baud(self._port.port):
+            # A pseudo-terminal answers at any speed, so none is known.
+            if not has_baud(self._port.port) or Path(self._port.port).resolve().parent == PSEUDO_TERMINALS:
                 suggested.pop('baud', None)
             self._port.suggested = suggested
 
