@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads bag folders and single MCAP files, written by this package, by ``ros2 bag record`` or by another program.
 
-A block is the samples with equal ``seq // block_size``. The recorded ``seq`` is modulo 2^32, which is not a multiple of
-the default block size, 20. So the reader restores the full numbers; its blocks are then those of the recorded node.
+A block is the samples with equal ``seq // block_size``. The recorded ``seq`` is modulo 2^32 (in some
+recordings, ``seq_high`` has the rest), which is not a multiple of the default block size, 20. So the reader restores
+the full numbers; its blocks are then those of the recorded node.
 """
 
 import contextlib
@@ -190,7 +191,7 @@ class BagRecording(Recording):
             expected_parameters |= {
                 name: value for name, value in rig_state.changed.items() if name in expected_parameters
             }
-            # A change that was sent again may differ from what is expected by now: it is no other rig.
+            # A message that repeats an earlier change may have other parameters than expected by now, of the same rig.
             if expected_parameters != rig_state.parameters and change not in changes:
                 self._add_warning(
                     f'another rig starts at log time {log_time} ns; the first rig is taken for the whole recording'
@@ -300,7 +301,7 @@ class BagRecording(Recording):
             batch = joined_points(messages)
             where = f'{self.path}: {SAMPLES} at log time {log_time} ns'
             # Where a sample number or a time goes back (wrap, restart), messages are numbered one by one.
-            # ``batch.full``: the recorded numbers have their high bits already.
+            # ``batch.full``: a field ``seq_high`` has the high bits, so the numbers do not wrap.
             is_continuous = numbering.follows(batch.seq, batch.t_ns, batch.full)
             parts = [batch] if is_continuous else [joined_points([message]) for message in messages]
             for part in parts:
