@@ -47,9 +47,7 @@ def scheduler() -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_every_engine_gives_the_serial_answer(
-    archive: Path, scheduler: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_engine_gives_the_serial_answer(archive: Path, scheduler: str, capsys: pytest.CaptureFixture[str]) -> None:
     stated: dict[str, tuple[str, bytes]] = {}
     for i, executor in enumerate(('serial', 'processes:1', scheduler)):
         out = archive / f'{i}.parquet'

@@ -78,9 +78,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert 'cannot be made' in capsys.readouterr().err
 
 
-def test_a_disk_that_rejects_is_one_line(
-    stand_in: MagicMock, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_disk_that_rejects_is_one_line(stand_in: MagicMock, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stand_in.RecordingStream.return_value.flush.side_effect = RuntimeError('File-writer thread shut down')
     assert main(['convert', str(BAGS / 'clean'), '--out', str(tmp_path / 'a.rrd')]) == 4
     assert 'a.rrd: cannot be written (File-writer thread shut down)' in capsys.readouterr().err

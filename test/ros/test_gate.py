@@ -151,9 +151,7 @@ def test_a_volatile_publisher_gets_no_latched_subscription(
     peer.until(lambda: heard('before'), 'what was kept')
 
 
-def test_unreliable_load_publisher_is_rejected_by_name(
-    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreliable_load_publisher_rejected_by_name(peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch) -> None:
     """It holds until the next: a lost one would be a wrong label of all that follows."""
     assert [topic for topic in INPUTS if HEARD[topic][0].delivery.reliable] == [LOAD, MARK]
     heard_as(monkeypatch, HEARD[LOAD][0].delivery)

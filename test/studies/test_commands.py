@@ -211,9 +211,7 @@ def late(moved: Path) -> Path:
     return path
 
 
-def test_the_offset_is_reported_and_removed_if_asked(
-    moved: Path, late: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_offset_is_reported_and_removed_if_asked(moved: Path, late: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['validate', str(moved), '--reference', str(late), '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     # The blocks' stamps lie in the middle of 20 samples; the row of the reference is the next one, half a sample on.

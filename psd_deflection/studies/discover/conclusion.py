@@ -287,12 +287,11 @@ class RigConclusion(Conclusion):
 
     def sentences(self) -> list[str]:
         """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
-        missing = _missing(self, ' besides' if self.setup else '')
+        setup = _setup(self)
+        missing = _missing(self, ' besides' if setup else '')
         tied = [t.sentence for t in ties(self.effects)]
         annotated = _as_annotated(self)
-        return [
-            s for s in (_setup(self), missing, *tied, annotated, _moved(self), law_sentence(self), *self.beyond) if s
-        ]
+        return [s for s in (setup, missing, *tied, annotated, _moved(self), law_sentence(self), *self.beyond) if s]
 
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
@@ -407,6 +406,8 @@ def _setup(discovery: RigConclusion) -> str:
     """What is wrong with the set-up, in a sentence, or nothing."""
     where: dict[str, dict[str, None]] = {}
     for f in discovery.setup:
+        if f.name in ('load_time', 'load_delay') and isinstance(f.value, float) and abs(f.value) < BY_HAND_S:
+            continue
         place = ', '.join(filter(None, (_place(f), _seconds(f))))
         where.setdefault(f.name.replace('_', ' '), {}).update({place: None} if place else {})
     names = [f'{name} ({"; ".join(places)})' if places else name for name, places in where.items()]
@@ -426,6 +427,8 @@ def _seconds(finding: Finding) -> str:
     return f'{abs(finding.value):.3g} s{direction}'
 
 
+BY_HAND_S = 0.1
+"""Nobody notes a load better by hand: such a time is corrected without a word in the answer's sentence."""
 STATIC = ('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance')
 """Effects that change how far a load moves the link at rest; stiffnesses with ``moves_frequency`` its ringing, too."""
 LEAST_FACTOR = 1e-3

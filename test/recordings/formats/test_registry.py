@@ -110,9 +110,7 @@ def test_a_format_made_as_the_page_says_is_read_like_ours(
     ('code', 'message'),
     [('raise ValueError(3)', r'cannot be loaded \(ValueError: 3\)'), ('FORMAT = 3', '3 is no psd_defl')],
 )
-def test_a_format_that_is_none_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, message: str
-) -> None:
+def test_format_that_is_none_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, message: str) -> None:
     install_plug_in(tmp_path, monkeypatch, 'logger', code, f'[{format.GROUP}]\nmine = my_package.logger:FORMAT\n')
     (tmp_path / 'run.npz').touch()
     with pytest.raises(ConfigError, match=f"format 'mine': my_package.logger:FORMAT.* ?{message}"):

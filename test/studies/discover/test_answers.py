@@ -660,13 +660,12 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery
 
 def test_wrong_notes_that_do_the_same_are_named(found: Discovery) -> None:
     soft, twists = (named_as(f'{way}_stiffness', scale=-0.2, moves_frequency=0.0) for way in ('bending', 'torsional'))
-    rings = named_as('torsional_stiffness', scale=-0.2, moves_frequency=1.0)
     same = 'times the noted ones would do the same: check'
     for effects, words in (
         ([soft], f'Forces 1.25 {same} the scale.'),
         ([twists], f'Torques 1.25 {same} the arm.'),
         ([soft, twists], f'Forces 1.25 times the noted ones and torques 1.25 {same} the scale and the arm.'),
-        ([rings], ''),
+        ([named_as('bending_stiffness', scale=-0.2, moves_frequency=1.0)], ''),
         ([soft, found.effects[0]], ''),
     ):
         sentences = dataclasses.replace(found, effects=tuple(effects)).sentences()
@@ -758,6 +757,10 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     assert sentence(verdict='nothing_missing', effects=(), setup=setup) == (
         'The set-up is not as the rig file or the recording says: channel sign (y1). '
         f'Nothing is missing besides: the gap is {left}.'
+    )
+    by_hand = Finding('load_time', 'load 1', -0.099, 'note it')
+    assert (
+        sentence(verdict='nothing_missing', effects=(), setup=(by_hand,)) == f'Nothing is missing: the gap is {left}.'
     )
     late = Finding('load_delay', 'load_fx load_fy load_tz', 0.4, 'subtract')
     assert sentence(setup=(late,)) == (
