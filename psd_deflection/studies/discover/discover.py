@@ -237,9 +237,13 @@ def _rounded_beside_effect(problem: Problem) -> bool:
         if not may_be_rounded(asked):
             return False
         implied += [p for p in asked.plateaus if np.any(p.annotated != 0.0)]
+    alone = _residual_gap(ws, fit, _best_beside(problem, []))
+    # Nothing leaves less than the noise does; the signatures of all loads take much memory.
+    if CLOSED * alone <= ws.floor():
+        return False
     free = ws.with_free((*ws.directions, *directions(ws, implied))).free
     loads = [] if free is None else [*free.rows]
-    alone, beside = (_residual_gap(ws, fit, [*known, *_best_beside(problem, known)]) for known in ([], loads))
+    beside = _residual_gap(ws, fit, [*loads, *_best_beside(problem, loads)])
     return beside < FOLLOWS * gap and beside < CLOSED * alone
 
 
