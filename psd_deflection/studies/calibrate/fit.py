@@ -25,6 +25,7 @@ from typing import Literal
 
 import numpy as np
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.misalignment.model import ALL, COUNT, TOLERANCES, ZERO, by_parameters, by_pose, readings
 from psd_deflection.model.misalignment.rig import CLAMP, RigVector, known_of_rig, stated_sd, vector_of_rig
 from psd_deflection.records import FloatArray
@@ -68,7 +69,10 @@ class Prior:
 
 
 def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
-    """From the rig file: its values and standard deviations, or the tolerances that it need not give."""
+    """From the rig file: its values and standard deviations, or the tolerances that it need not give.
+
+    Raises ConfigError for a standard deviation of 0, and as :func:`known_of_rig` does.
+    """
     vector = vector_of_rig(rig) if vector is None else vector
     covariance = np.zeros((SIZE, SIZE))
     covariance[:COUNT, :COUNT] = known_of_rig(rig).covariance
@@ -76,6 +80,8 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
     covariance[ZERO:COUNT] = covariance[:, ZERO:COUNT] = 0.0
     covariance[ZERO:COUNT, ZERO:COUNT] = np.diag(TOLERANCES[ZERO:] ** 2)
     stated = stated_sd(rig)
+    if exact := [name for name, sd in stated.items() if sd == 0.0 and name not in CLAMP]:
+        raise ConfigError(f'calibration.sds: 0 for {exact[0]}: must be greater than 0, or it cannot be calibrated')
     compliance = (rig.link.length / rig.link.bending_stiffness, rig.link.length / rig.link.torsional_stiffness)
     # A tip force F gives L^3 F/3EI; a clamp that turns by c F L moves the tip by c F L^2.
     shares = (CLAMP_SHARE * compliance[0] / 3.0, CLAMP_SHARE * compliance[1])

@@ -14,6 +14,7 @@ from scipy.stats import chi2, multivariate_normal
 
 import psd_deflection
 from blind import misaligned
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import COUNT, INDEX, PARAMETERS, TOLERANCES, ZERO
 from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
@@ -483,3 +484,9 @@ def test_rejection_and_covariance_are_in_the_file_and_none_is_null() -> None:
     written = known_of_rig(replace_values(found.rig, values)).covariance
     off = (written - covariance[:COUNT, :COUNT]) / np.outer(TOLERANCES, TOLERANCES)
     np.testing.assert_allclose(off, 0.0, atol=1e-8)
+
+
+def test_a_stated_deviation_of_zero_cannot_be_calibrated() -> None:
+    rig = replace_values(RIG, {'calibration.names': ['psd_1.gain_x'], 'calibration.sds': [0.0]})
+    with pytest.raises(ConfigError, match=r'calibration\.sds: 0 for psd_1\.gain_x: must be greater than 0'):
+        fitting.prior_of_rig(rig)
