@@ -61,9 +61,9 @@ def rig_at_end(recording: Recording) -> Rig:
 def zero_variances_at_end(recording: Recording, rig: Rig) -> tuple[float, ...]:
     """Variances (2P,), m^2, of the zero that was taken last; () if none was. ``rig``: its rig at the end.
 
-    A zero in the parameters with which the recording begins was taken, too, and is no more exact.
+    A zero with which the recording begins, or of a rig file beside it, was taken, too, and is no more exact.
     """
-    variances = zero_variances(rig) if rig_at_start(recording).zeros.any() else ()
+    variances = zero_variances(rig) if rig.zeros.any() else ()
     for change in recording.changes:
         reported = dict(change.values)
         if any(name in ZEROS for name in reported):

@@ -602,8 +602,8 @@ def test_zero_of_a_recording_has_variances(changes: Any, variances: Any, monkeyp
     reported = [ParameterChange(0, i, tuple(c.items())) for i, c in enumerate(changes)]
     monkeypatch.setattr(recording, 'changes', reported)
     assert zero_variances_at_end(recording, RIG) == variances
-    monkeypatch.setattr(recording, 'parameters', {**recording.parameters, 'psd_1.zero': [1e-6, 0.0]})
-    assert zero_variances_at_end(recording, RIG) == (variances or ZERO)
+    zeroed = replace_values(RIG, {'psd_1.zero': [1e-6, 0.0]})
+    assert zero_variances_at_end(recording, zeroed) == (variances or ZERO)
 
 
 def test_a_zero_that_gives_nothing_is_the_mean_of_half_a_second() -> None:
