@@ -21,7 +21,7 @@ from psd_deflection.studies.discover.hidden import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.annotated_times import CorrectedNote, MeasuredLoad, shifted
 from psd_deflection.studies.loads.effective import SwayingLoad, swaying
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, implied_loads, plateaus
+from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, WrongNote, find_holds, implied_loads
 
 FREE_MOMENTS = 40.0
 """How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
@@ -40,30 +40,30 @@ LEAST_REPORTED = (0.02, 0.02, 0.01)
 BoolArray = npt.NDArray[np.bool_]
 
 
-def times(o: Observation, recording: int) -> list[Plateau]:
+def times(o: Observation, recording: int) -> list[Hold]:
     """Those of a recording between changes of its load."""
-    return plateaus(o.rig, o.volts, o.loads, recording)
+    return find_holds(o.rig, o.volts, o.loads, recording)
 
 
-def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
+def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Hold]) -> ImpliedLoads:
     """Return the loads that ``difference`` (3P, m), V, measured minus simulated, asks for."""
     o = ws.observations[recording]
     return implied_loads(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
 
 
-def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: PlateauLoads) -> list[SwayingLoad]:
+def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: ImpliedLoads) -> list[SwayingLoad]:
     """Loads that swayed; ``implied``: what ``difference`` asks for between all steps."""
     o = ws.observations[recording]
-    annotated = plateaus(o.rig, o.volts, o.loads, recording, annotated_only=True)
+    annotated = find_holds(o.rig, o.volts, o.loads, recording, annotated_only=True)
     return swaying(implied, annotated, partial(levels, ws, recording, difference), o.period)
 
 
-def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
+def directions(ws: Workspace, wrong: Sequence[Hold]) -> list[LoadDirection]:
     """Any load in each of ``wrong``, and the times at which it was hung and taken off if nobody noted them."""
     free, out = np.full(3, FREE), list[LoadDirection]()
     for p in wrong:
         o = ws.observations[p.recording]
-        out += of_plateau(o, p.recording, p, free)
+        out += of_hold(o, p.recording, p, free)
         for at in _unannotated(p):
             out += in_time(
                 o,
@@ -73,7 +73,7 @@ def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
     return out
 
 
-def _unannotated(p: Plateau) -> list[int]:
+def _unannotated(p: Hold) -> list[int]:
     """Return the samples at which it began and ended, if nothing was noted then."""
     return [*([p.first] if p.unannotated else []), *([p.last] if p.end_unannotated else [])]
 
@@ -89,13 +89,13 @@ def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDir
     ]
 
 
-def of_plateau(o: Observation, recording: int, plateau: Plateau | MeasuredLoad, sd: FloatArray) -> list[LoadDirection]:
-    """1 N or 1 N m more in ``plateau``, known to ``sd`` (3,) N, N, N m; axes that are known exactly are left out."""
+def of_hold(o: Observation, recording: int, hold: Hold | MeasuredLoad, sd: FloatArray) -> list[LoadDirection]:
+    """1 N or 1 N m more in ``hold``, known to ``sd`` (3,) N, N, N m; axes that are known exactly are left out."""
     out = []
     for axis in np.flatnonzero(sd > 0.0).tolist():
         more = np.zeros_like(o.loads)
-        more[plateau.first : plateau.last, axis] = 1.0
-        out.append(LoadDirection(recording, more, float(sd[axis]), plateau, axis))
+        more[hold.first : hold.last, axis] = 1.0
+        out.append(LoadDirection(recording, more, float(sd[axis]), hold, axis))
     return out
 
 
@@ -134,7 +134,7 @@ def _decays(p: Physics) -> list[tuple[float, float]]:
     return [*[(bending, bending * p.bending_damping_ratio)] * 2, (torsion, torsion * p.torsion_damping_ratio)]
 
 
-def wrong_load_findings(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
+def wrong_load_findings(ws: Workspace, wrong: Sequence[Hold]) -> list[Finding]:
     """What hung in each of ``wrong``, after the search."""
     sds = ws.direction_sd()
     out = []
@@ -147,7 +147,7 @@ def wrong_load_findings(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding
     return out
 
 
-def _timed(ws: Workspace, p: Plateau) -> Plateau:
+def _timed(ws: Workspace, p: Hold) -> Hold:
     """``p`` between the times that were fitted, in whole samples."""
     moved = {}
     for d in ws.directions:

@@ -60,8 +60,8 @@ from psd_deflection.studies.discover.steps import (
     without_effect,
 )
 from psd_deflection.studies.loads.alignment import SKEW
+from psd_deflection.studies.loads.holds import all_free, may_be_rounded, rounded
 from psd_deflection.studies.loads.plate_motion import dots_of
-from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded
 
 FREE_FROM = 10.0
 """A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
@@ -236,7 +236,7 @@ def _rounded_beside_effect(problem: Problem) -> bool:
         asked = levels(ws, i, difference, times(o, i))
         if not may_be_rounded(asked):
             return False
-        implied += [p for p in asked.plateaus if np.any(p.annotated != 0.0)]
+        implied += [p for p in asked.holds if np.any(p.annotated != 0.0)]
     alone = _residual_gap(ws, fit, _best_beside(problem, []))
     # Nothing leaves less than the noise does; the signatures of all loads take much memory.
     if CLOSED * alone <= ws.floor():
@@ -290,7 +290,7 @@ def _with_all_loads_free(
             return None
         # A person knows when nothing hangs.
         implied_of_loads = [
-            (p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.annotated != 0.0)
+            (p, more) for p, more in zip(asked.holds, asked.more, strict=True) if np.any(p.annotated != 0.0)
         ]
         loads = o.loads.copy()
         for p, more in implied_of_loads:

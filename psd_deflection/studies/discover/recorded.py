@@ -22,7 +22,7 @@ from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import note_finding
-from psd_deflection.studies.discover.applied import directions, in_time, levels, of_plateau, swayed, times
+from psd_deflection.studies.discover.applied import directions, in_time, levels, of_hold, swayed, times
 from psd_deflection.studies.discover.cleaning import clean, time_loads
 from psd_deflection.studies.discover.hidden import Direction, LoadDirection, ZeroDirection, beginning
 from psd_deflection.studies.discover.redundant import FourthReading, fourth_reading, solved
@@ -40,7 +40,7 @@ from psd_deflection.studies.loads.effective import (
     unannotated_times,
     without_times,
 )
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_applied, wrong_notes_against
+from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, WrongNote, as_applied, wrong_notes_against
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
@@ -72,7 +72,7 @@ class Recorded:
     value_grid_stated: bool = False
     delays: tuple[float, ...] = ()
     corrected: tuple[CorrectedLoads | None, ...] = ()
-    wrong: tuple[Plateau, ...] = ()
+    wrong: tuple[Hold, ...] = ()
     fourth: FourthReading | None = None
     late: tuple[LatePsd, ...] = ()
 
@@ -236,10 +236,7 @@ def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Work
     ]
     both = zip(notes, workspace.observations, strict=True)
     free = [
-        n.plateau
-        for notes_of_recording in notes
-        for n in notes_of_recording
-        if isinstance(n, WrongNote) and not n.exact
+        n.hold for notes_of_recording in notes for n in notes_of_recording if isinstance(n, WrongNote) and not n.exact
     ]
     findings = [
         note_finding(n, o.name)
@@ -281,13 +278,13 @@ def _wrong_notes(
     return [*swayed(workspace, i, difference, implied), *wrong]
 
 
-def _implied_loads(workspace: Workspace, i: int, implied: PlateauLoads, acting: FloatArray) -> PlateauLoads:
+def _implied_loads(workspace: Workspace, i: int, implied: ImpliedLoads, acting: FloatArray) -> ImpliedLoads:
     """Return the loads that recording ``i`` asks for under ``acting`` ones; ``implied``: under those that it has."""
     o = workspace.observations[i]
     if acting is o.loads:
         return implied
     moved = workspace.loaded(i, acting)
-    return levels(workspace, i, moved.residual(moved.base)[1][i], implied.plateaus)
+    return levels(workspace, i, moved.residual(moved.base)[1][i], implied.holds)
 
 
 def _with_effective_loads(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnannotatedTime]) -> Observation:
@@ -323,7 +320,7 @@ def with_free(recorded: Recorded, workspace: Workspace) -> Workspace:
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(corrected.loads).max(axis=0), 1e-30)
         if len(corrected.measured) <= MOST_MEASURED:
-            free += [d for m in corrected.measured for d in of_plateau(o, i, m, m.sd * unit)]
+            free += [d for m in corrected.measured for d in of_hold(o, i, m, m.sd * unit)]
     workspace = workspace.with_free(free)
     # What a large load bends is no change in proportion.
     for _ in range(2 if recorded.wrong else 0):

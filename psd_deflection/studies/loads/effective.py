@@ -12,19 +12,19 @@ import numpy as np
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.annotated_times import SETTLED_S, CorrectedNote
-from psd_deflection.studies.loads.plateaus import (
+from psd_deflection.studies.loads.holds import (
     FEWEST,
     PLATE,
     PLATE_M,
     SHARE,
     STANDS_OUT,
     TOLERANCE,
-    Plateau,
-    PlateauLoads,
+    Hold,
+    ImpliedLoads,
     WrongNote,
     as_applied,
+    find_holds,
     implied_beside_rig,
-    plateaus,
     wrong_notes,
 )
 
@@ -42,12 +42,12 @@ RINGS_S = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SwayingLoad:
-    """A weight that swayed: its plateau, the amplitude of the force, N, and the frequency, Hz. ``period``: s from one
-    sample to the next. ``swung`` (k, 3): N, N, N m, what it added to the load in each sample of the plateau, about; a
+    """A weight that swayed: its hold, the amplitude of the force, N, and the frequency, Hz. ``period``: s from one
+    sample to the next. ``swung`` (k, 3): N, N, N m, what it added to the load in each sample of the hold, about; a
     clamp that sticks keeps the last of it.
     """
 
-    plateau: Plateau
+    hold: Hold
     force: float
     frequency: float
     period: float
@@ -61,7 +61,7 @@ class SwayingLoad:
     @property
     def where(self) -> str:
         """``load 3``."""
-        return f'load {self.plateau.number}'
+        return f'load {self.hold.number}'
 
     @property
     def value(self) -> None:
@@ -75,7 +75,7 @@ class SwayingLoad:
 
     def words(self, name: str) -> str:
         """What happened, and what to do; ``name``: of the recording."""
-        p = self.plateau
+        p = self.hold
         return (
             f'the weight that hung on the link of {name} from {p.first * self.period:.3f} s to '
             f'{p.last * self.period:.3f} s swayed at {self.frequency:.2f} Hz by {self.force:.2g} N: '
@@ -84,18 +84,18 @@ class SwayingLoad:
 
 
 def swaying(
-    implied: PlateauLoads,
-    annotated: Sequence[Plateau],
-    again: Callable[[Sequence[Plateau]], PlateauLoads],
+    implied: ImpliedLoads,
+    annotated: Sequence[Hold],
+    again: Callable[[Sequence[Hold]], ImpliedLoads],
     period: float,
 ) -> list[SwayingLoad]:
     """Return the holds of ``implied`` in which the link swings. ``annotated``: between annotated changes; ``again``:
-    the loads that other plateaus ask for; ``period``: s from one sample to the next.
+    the loads that other holds ask for; ``period``: s from one sample to the next.
     """
     implied = _not_cut(implied, annotated, again)
     size, fine = implied.size, period * implied.size
     rows = []
-    for p in implied.plateaus:
+    for p in implied.holds:
         a, b = p.first // size + round(RINGS_S / fine), p.last // size
         part = implied.rest[:2, a:b]
         there = np.isfinite(part).all(axis=0)
@@ -120,7 +120,7 @@ def swaying(
     sizes = np.array([r[0] for r in rows])
     limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
     out: dict[int, SwayingLoad] = {}
-    for p, (moved, force, frequency) in sorted(zip(implied.plateaus, rows, strict=True), key=lambda both: both[1][0]):
+    for p, (moved, force, frequency) in sorted(zip(implied.holds, rows, strict=True), key=lambda both: both[1][0]):
         if moved > limit:
             # A strong sway seems to step: all of the time of that load, from its largest part.
             annotated_hold = next((w for w in annotated if w.first <= p.first < w.last), p)
@@ -130,7 +130,7 @@ def swaying(
     return [out[first] for first in sorted(out)]
 
 
-def _swung(implied: PlateauLoads, p: Plateau, frequency: float, period: float) -> FloatArray:
+def _swung(implied: ImpliedLoads, p: Hold, frequency: float, period: float) -> FloatArray:
     """(k, 3): the load in each sample of ``p`` that the link swings with: a tone whose amplitude changes slowly."""
     size, count = implied.size, p.last - p.first
     a, b = p.first // size + round(RINGS_S / (period * size)), p.last // size
@@ -158,7 +158,7 @@ def swung(samples: int, swayed: Sequence[SwayingLoad]) -> FloatArray | None:
     out = np.zeros((samples, 3))
     for s in swayed:
         if s.swung is not None:
-            out[s.plateau.first : s.plateau.last] += s.swung
+            out[s.hold.first : s.hold.last] += s.swung
     return out
 
 
@@ -169,10 +169,10 @@ def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[Swayin
     """
     period = 1.0 / rig.converter.sample_rate_hz
     asked = implied_beside_rig(rig, volts, loads)
-    listed = plateaus(rig, volts, loads)
+    listed = find_holds(rig, volts, loads)
     if len(listed) < FEWEST:
         return []
-    return swaying(asked(listed), plateaus(rig, volts, loads, annotated_only=True), asked, period)
+    return swaying(asked(listed), find_holds(rig, volts, loads, annotated_only=True), asked, period)
 
 
 def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
@@ -181,7 +181,7 @@ def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> Floa
     d = rig.dynamics
     slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))
     for s in swayed:
-        out[s.plateau.first : s.plateau.last + round(SETTLED_S * slowest / s.period)] = np.nan
+        out[s.hold.first : s.hold.last + round(SETTLED_S * slowest / s.period)] = np.nan
     return out
 
 
@@ -199,15 +199,15 @@ def peak_frequency(f: FloatArray, power: FloatArray) -> float:
 
 
 def _not_cut(
-    implied: PlateauLoads, annotated: Sequence[Plateau], again: Callable[[Sequence[Plateau]], PlateauLoads]
-) -> PlateauLoads:
+    implied: ImpliedLoads, annotated: Sequence[Hold], again: Callable[[Sequence[Hold]], ImpliedLoads]
+) -> ImpliedLoads:
     """What swings seems to step, too: the time of an annotated load is whole if steps cut it into too short pieces."""
-    listed = list[Plateau]()
+    listed = list[Hold]()
     for annotated_hold in annotated:
-        pieces = [p for p in implied.plateaus if p.number == annotated_hold.number]
+        pieces = [p for p in implied.holds if p.number == annotated_hold.number]
         all_there = sum(p.last - p.first for p in pieces) >= annotated_hold.last - annotated_hold.first
         listed += pieces if all_there else [annotated_hold]
-    return implied if listed == [*implied.plateaus] else again(listed)
+    return implied if listed == [*implied.holds] else again(listed)
 
 
 MANY = 3
@@ -255,7 +255,7 @@ class UnannotatedTime:
         )
 
 
-def unannotated_times(implied: PlateauLoads, samples: int, period: float) -> list[UnannotatedTime]:
+def unannotated_times(implied: ImpliedLoads, samples: int, period: float) -> list[UnannotatedTime]:
     """Those of a recording of so many ``samples``; none if no annotated load would be left. ``period``: s from one
     sample to the next.
 
@@ -263,20 +263,18 @@ def unannotated_times(implied: PlateauLoads, samples: int, period: float) -> lis
     """
     allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(implied.annotated).max(initial=0.0))
     out = []
-    numbered = groupby(range(len(implied.plateaus)), key=lambda k: implied.plateaus[k].number)
+    numbered = groupby(range(len(implied.holds)), key=lambda k: implied.holds[k].number)
     for _, group in numbered:
         in_group = list(group)
         more = implied.more[in_group]
         steps = np.abs(np.diff(more, axis=0)).max(axis=1) > allowed
-        alone = [
-            k for k, stepped in zip(in_group[1:], steps, strict=True) if stepped and implied.plateaus[k].unannotated
-        ]
+        alone = [k for k, stepped in zip(in_group[1:], steps, strict=True) if stepped and implied.holds[k].unannotated]
         as_plate = np.abs(implied.across[in_group]).max() <= PLATE * float(implied.sizes[in_group].max()) + PLATE_M
         if len(alone) >= MANY and as_plate:
-            first, last = implied.plateaus[alone[0]].first, implied.plateaus[in_group[-1]].last
+            first, last = implied.holds[alone[0]].first, implied.holds[in_group[-1]].last
             out.append(UnannotatedTime(first, last, samples, len(alone), period))
     remaining = [
-        p for p in implied.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.annotated != 0.0)
+        p for p in implied.holds if not any(u.first <= p.first < u.last for u in out) and np.any(p.annotated != 0.0)
     ]
     return out if remaining else []
 
@@ -312,7 +310,7 @@ def effective_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> Effective
     swayed = swaying_loads(rig, volts, loads)
     steady = excluded(rig, volts, swayed)
     wrong = wrong_notes(rig, steady, loads)
-    listed = plateaus(rig, volts, loads)
+    listed = find_holds(rig, volts, loads)
     if not wrong and sum(p.unannotated for p in listed) >= MANY:
         implied = implied_beside_rig(rig, volts, loads)(listed)
         if unannotated := unannotated_times(implied, len(loads), period):

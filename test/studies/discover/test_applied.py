@@ -31,7 +31,7 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.weighing import Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.annotated_times import CorrectedNote
-from psd_deflection.studies.loads.plateaus import Plateau
+from psd_deflection.studies.loads.holds import Hold
 from test.studies.discover.test_formulas import make_observation
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, read
 
@@ -185,7 +185,7 @@ def test_the_times_that_nobody_noted_are_free(began: bool, ended: bool) -> None:
     o = Observation('x', RIG, np.zeros((4000, 6)), np.zeros((4000, 3)))
     o.loads[1000:2500] = (3.0, -4.0, 2.0)
     ws = Workspace([o])
-    found = directions(ws, [Plateau(0, 1000, 2500, 1, began, o.loads[1000], ended)])
+    found = directions(ws, [Hold(0, 1000, 2500, 1, began, o.loads[1000], ended)])
     assert [d.axis for d in found[:3]] == [0, 1, 2]
     applied = np.zeros((3, 4000, 3))
     applied[[0, 1, 2], 1000:2500, [0, 1, 2]] = 1.0

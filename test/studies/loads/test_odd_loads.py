@@ -21,12 +21,12 @@ from psd_deflection.studies.loads.effective import (
     swaying_loads,
     unannotated_times,
 )
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, implied_beside_rig, plateaus
+from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, find_holds, implied_beside_rig
 from test.studies.held_loads import DWELL, HELD, RIG, T, answers, read
 
 
 def swung(force: float, frequency: float, axis: int = 0, number: int = 3) -> FloatArray:
-    """The loads with a swing in one plateau."""
+    """The loads with a swing in one hold."""
     out = HELD.copy()
     since = T - number * DWELL / 1000.0
     held = (since > 0.0) & (since < DWELL / 1000.0)
@@ -56,7 +56,7 @@ def test_sway_is_named_alike_everywhere() -> None:
 @pytest.mark.parametrize(('force', 'frequency', 'axis'), [(0.5, 0.9, 0), (2.0, 1.6, 0), (1.0, 1.1, 1)])
 def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: float, axis: int) -> None:
     (found,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HELD)
-    assert found.plateau.number == 3
+    assert found.hold.number == 3
     assert found.frequency == pytest.approx(frequency, abs=0.02)
     assert found.force == pytest.approx(force, rel=0.1)
     # How it swung, but for how much more a link of 14 Hz swings than under a load that rests.
@@ -70,7 +70,7 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
 
 
 def test_apparent_step_excludes_sway_from_its_start() -> None:
-    asked, annotated = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, annotated_only=True)
+    asked, annotated = implied_beside_rig(RIG, SWUNG, HELD), find_holds(RIG, SWUNG, HELD, annotated_only=True)
     cut = 3 * DWELL + 1200
     pieces = [
         *annotated[:3],
@@ -79,7 +79,7 @@ def test_apparent_step_excludes_sway_from_its_start() -> None:
         *annotated[4:],
     ]
     (found,) = effective.swaying(asked(pieces), annotated, asked, 1e-3)
-    assert (found.plateau.first, found.plateau.last) == (3 * DWELL, 4 * DWELL)
+    assert (found.hold.first, found.hold.last) == (3 * DWELL, 4 * DWELL)
 
 
 ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
@@ -97,7 +97,7 @@ def test_what_no_weight_does_is_no_sway(true: dict[str, object]) -> None:
 def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
     rig = load_rig(overrides={'dynamics.bending_frequency': 10.0, 'dynamics.bending_damping_ratio': 0.05})
     volts = np.zeros((9000, 6))
-    swayed = [SwayingLoad(Plateau(0, 2000, 5000, 1, False, np.zeros(3)), 1.0, 1.0, 1e-3)]
+    swayed = [SwayingLoad(Hold(0, 2000, 5000, 1, False, np.zeros(3)), 1.0, 1.0, 1e-3)]
     rest = round(5.0 / (2.0 * math.pi * 10.0 * 0.05) / 1e-3)
     gone = np.flatnonzero(np.isnan(excluded(rig, volts, swayed)).all(axis=1))
     assert gone.tolist() == list(range(2000, 5000 + rest))
@@ -117,15 +117,15 @@ def test_a_peak_is_the_vertex_of_a_log_parabola() -> None:
 def test_a_swing_is_what_no_constant_load_explains() -> None:
     """A tone of 1.3 Hz that fades from 2 N, in means of four samples."""
     n, size = 4000, 4
-    held = tuple(Plateau(0, n * k, n * (k + 1), k, False, np.zeros(3)) for k in range(6))
+    held = tuple(Hold(0, n * k, n * (k + 1), k, False, np.zeros(3)) for k in range(6))
     t = np.arange(n) * 1e-3
     force = 2.0 * (1.0 - 0.1 * t) * np.sin(2.0 * math.pi * 1.3 * t + 0.4)
     rest = 1e-9 * np.random.default_rng(0).standard_normal((3, 6 * n // size))
     rest[1, 3 * n // size : n] += 2e-5 * force.reshape(-1, size).mean(axis=1)
     none = np.zeros((6, 3))
-    implied = PlateauLoads(held, none, rest, rest, rest[:1], none[:, 0], np.array([1e-5, 2e-5, 1e-4]), size)
+    implied = ImpliedLoads(held, none, rest, rest, rest[:1], none[:, 0], np.array([1e-5, 2e-5, 1e-4]), size)
     (found,) = effective.swaying(implied, held, lambda _: implied, 1e-3)
-    assert found.plateau is held[3]
+    assert found.hold is held[3]
     assert [found.frequency, found.force] == [pytest.approx(1.3, abs=0.01), pytest.approx(1.6, abs=0.1)]
     assert found.swung is not None
     np.testing.assert_allclose(found.swung[:, 1], force, atol=5e-3)
@@ -136,7 +136,7 @@ def test_a_swing_is_what_no_constant_load_explains() -> None:
     lost[:, -900:-890] = np.nan
     lost[1, n:] += 2e-6 * np.tile(force, 2).reshape(-1, size).mean(axis=1)
     implied = dataclasses.replace(implied, rest=lost)
-    assert [s.plateau for s in effective.swaying(implied, held, lambda _: implied, 1e-3)] == [held[3]]
+    assert [s.hold for s in effective.swaying(implied, held, lambda _: implied, 1e-3)] == [held[3]]
 
 
 MANY_LEVELS = np.array(
@@ -196,15 +196,15 @@ def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
     assert np.isfinite(effective.volts).all()
 
 
-def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: float = 10.0) -> PlateauLoads:
+def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: float = 10.0) -> ImpliedLoads:
     """Plateaus of 2 s under one annotated load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
     rows = np.array([(0.0, y, 0.0) for y in more])
     listed = tuple(
-        Plateau(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, annotated, 0.0))) for i in range(len(more))
+        Hold(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, annotated, 0.0))) for i in range(len(more))
     )
-    other = Plateau(0, 2000 * len(more), 2000 * len(more) + 2000, 2, False, np.array((0.0, 20.0, 0.0)))
+    other = Hold(0, 2000 * len(more), 2000 * len(more) + 2000, 2, False, np.array((0.0, 20.0, 0.0)))
     nothing = np.zeros((3, 0))
-    return PlateauLoads(
+    return ImpliedLoads(
         (*listed, other),
         np.vstack((rows, np.zeros((1, 3)))),
         nothing,
@@ -224,8 +224,8 @@ def test_change_counts_above_three_times_allowed_effects() -> None:
     assert unannotated_times(asked([0.0, 1.4, 0.0, 1.4], alone=1), 20_000, 0.001) == []
     # Where nobody knows any load there is nothing left to compare.
     of = asked([0.0, 1.6, 0.0, 1.6], alone=1)
-    known = [dataclasses.replace(p, annotated=np.zeros(3)) if i in (0, 4) else p for i, p in enumerate(of.plateaus)]
-    assert unannotated_times(dataclasses.replace(of, plateaus=tuple(known)), 20_000, 0.001) == []
+    known = [dataclasses.replace(p, annotated=np.zeros(3)) if i in (0, 4) else p for i, p in enumerate(of.holds)]
+    assert unannotated_times(dataclasses.replace(of, holds=tuple(known)), 20_000, 0.001) == []
 
 
 def test_two_changes_are_too_few_and_noted_ones_do_not_count() -> None:

@@ -10,9 +10,9 @@ import pytest
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
-from psd_deflection.studies.loads import plateaus
+from psd_deflection.studies.loads import holds
 from psd_deflection.studies.loads.annotated_times import correct_loads, unannotated_steps
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, all_free, as_applied, wrong_notes
+from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, all_free, as_applied, wrong_notes
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, annotated_as, answers, read
 
 QUIET = read(HELD)
@@ -144,9 +144,9 @@ def asked(off: FloatArray, annotated: FloatArray = ROUNDED, acting: FloatArray |
 
     ``acting`` (n, 3): with what is simulated, if it is something else.
     """
-    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
+    listed = tuple(Hold(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
     moved = np.repeat(off.T * 1e-6, 10, axis=1)
-    found = PlateauLoads(listed, off, np.zeros_like(moved), moved, moved[0], np.zeros(8), np.ones(3), 400)
+    found = ImpliedLoads(listed, off, np.zeros_like(moved), moved, moved[0], np.zeros(8), np.ones(3), 400)
     return all_free(found, np.repeat(annotated, DWELL, axis=0) if acting is None else acting)
 
 
@@ -173,7 +173,7 @@ def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
     annotated = acting.copy()
     annotated[4000:6000] = (0.0, -20.0, 0.0)
-    listed = plateaus.plateaus(RIG, read(acting), annotated)
+    listed = holds.find_holds(RIG, read(acting), annotated)
     assert [(p.number, p.unannotated) for p in listed] == [(0, False), (1, False), (1, True), (2, False)]
     assert [p.first for p in listed] == pytest.approx([0, 2000, 4000, 6000], abs=2)
     assert [p.last for p in listed] == pytest.approx([2000, 4000, 6000, 8000], abs=2)
@@ -187,14 +187,14 @@ def test_steps_without_a_note_are_looked_for_in_metres() -> None:
     volts[2000:, 0] += 1.0
     volts[4000:, 1] += 1.0
     loads[4000:] = 1.0
-    listed = plateaus.plateaus(rig, volts, loads)
+    listed = holds.find_holds(rig, volts, loads)
     assert [p.first for p in listed] == pytest.approx([0, 2000, 4000], abs=50)
     assert [(p.number, p.unannotated, p.end_unannotated) for p in listed] == [
         (0, False, True),
         (0, True, False),
         (1, False, False),
     ]
-    assert len(plateaus.plateaus(rig, volts, loads, annotated_only=True)) == 2
+    assert len(holds.find_holds(rig, volts, loads, annotated_only=True)) == 2
 
 
 VARIED = np.array(
@@ -210,17 +210,17 @@ def observed(
     across: dict[int, float] | None = None,
     left: float = 0.0,
     everywhere: FloatArray | float = 0.0,
-) -> PlateauLoads:
+) -> ImpliedLoads:
     """What readings say if loads are off by ``more``; ``left``: share of the movement that no load explains."""
     off = np.zeros(annotated.shape) + everywhere
     for k, load in more.items():
         off[k] += load
-    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
+    listed = tuple(Hold(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
     moved = np.repeat((off * (1e-5, 1e-5, 1e-4)).T, 10, axis=1)
     beside = np.zeros(len(annotated))
     for k, far in (across or {}).items():
         beside[k] = far
-    return PlateauLoads(listed, off, left * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
+    return ImpliedLoads(listed, off, left * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
 
 
 def test_load_size_is_plate_movement_at_0_1_m() -> None:
@@ -248,13 +248,13 @@ def test_load_size_is_plate_movement_at_0_1_m() -> None:
 def test_wrong_loads_need_five_right_ones_beside_them(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    found = plateaus.outliers(observed(more, VARIED[:count]))
+    found = holds.outliers(observed(more, VARIED[:count]))
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
 def test_beside_loads_within_their_tolerance_six_must_be_right() -> None:
     for count, gone in ((7, (2,)), (6, ())):
-        found = plateaus.outliers(observed({2: (0.0, 10.0, 0.0)}, VARIED[:count], everywhere=0.2))
+        found = holds.outliers(observed({2: (0.0, 10.0, 0.0)}, VARIED[:count], everywhere=0.2))
         assert (found.gone, found.softer) == (gone, 0.0)
 
 
@@ -263,41 +263,41 @@ def test_load_is_known_if_others_leave_a_twentieth_of_it(torque: float, gone: tu
     # The only torque, beside a force of 50 N: a twentieth of both is 2.503.
     annotated = VARIED * (1.0, 1.0, 0.0)
     annotated[2, 2] = torque
-    assert plateaus.outliers(observed({2: (0.0, 1.0, 0.0)}, annotated)).gone == gone
+    assert holds.outliers(observed({2: (0.0, 1.0, 0.0)}, annotated)).gone == gone
 
 
 def test_a_faulty_detector_is_no_wrong_note() -> None:
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
     for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
-        assert plateaus.outliers(observed(wrong, across={6: far})).gone == gone
-    assert plateaus.outliers(observed(wrong, across={1: 1e-3})).gone == (6,)
+        assert holds.outliers(observed(wrong, across={6: far})).gone == gone
+    assert holds.outliers(observed(wrong, across={1: 1e-3})).gone == (6,)
     # Far beyond the tolerance no plate is asked for.
-    far_off = plateaus.outliers(observed({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
+    far_off = holds.outliers(observed({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
-    assert not plateaus.closes(observed({}))
-    assert plateaus.closes(replace(observed(wrong), rest=np.ones((3, 80)) * [[1e-3], [0.0], [2e-3]]))
+    assert not holds.closes(observed({}))
+    assert holds.closes(replace(observed(wrong), rest=np.ones((3, 80)) * [[1e-3], [0.0], [2e-3]]))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
-        assert plateaus.outliers(observed(wrong, left=left), bent).gone == gone
+        assert holds.outliers(observed(wrong, left=left), bent).gone == gone
 
 
 def test_loads_are_free_if_explained_and_two_are_off() -> None:
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
     loads = np.repeat(VARIED, DWELL, axis=0)
     for left, free in ((0.19, True), (0.21, False)):
-        assert plateaus.all_free(observed(off, left=left), loads) is free
-    assert plateaus.all_free(observed({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, VARIED[:4]), loads)
-    assert not plateaus.all_free(observed({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, VARIED[:3]), loads)
+        assert holds.all_free(observed(off, left=left), loads) is free
+    assert holds.all_free(observed({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, VARIED[:4]), loads)
+    assert not holds.all_free(observed({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, VARIED[:3]), loads)
     # Two that are off by more than the tolerance are enough.
     two = observed({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
-    apart = plateaus.deviation_in_tolerances(two, (), 0.1)
+    apart = holds.deviation_in_tolerances(two, (), 0.1)
     assert sorted(apart)[-3] < 1.0 < sorted(apart)[-2]
     assert max(apart) < 2.0
-    assert plateaus.all_free(two, loads)
+    assert holds.all_free(two, loads)
     # One alone is a wrong note, and others are needed to say so.
     found = observed({0: (0.0, 0.0, 0.6)})
-    assert int((plateaus.deviation_in_tolerances(found, (), 0.1) > 1.0).sum()) == 1
-    assert not plateaus.all_free(found, loads)
+    assert int((holds.deviation_in_tolerances(found, (), 0.1) > 1.0).sum()) == 1
+    assert not holds.all_free(found, loads)
 
 
 def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
@@ -309,7 +309,7 @@ def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
     def rounded(*off: tuple[float, float, float], count: int = 5) -> bool:
         more = np.zeros((5, 3))
         more[: len(off)] = off
-        return plateaus.are_rounded(observed({}, annotated[:count], everywhere=more[:count]), loads)
+        return holds.are_rounded(observed({}, annotated[:count], everywhere=more[:count]), loads)
 
     # Forces in steps of 5 N, torques in steps of 2 N m.
     assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
@@ -330,31 +330,31 @@ def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
 @pytest.mark.parametrize(('annotated', 'step'), [(VARIED, 10.0), (VARIED[:5], 10.0), (VARIED / 10.0, 1.0)])
 def test_forces_may_be_rounded_if_off_by_less_than_a_step(annotated: FloatArray, step: float) -> None:
     for off, may in ((0.999, True), (-0.999, True), (1.0, False), (-1.0, False)):
-        assert plateaus.may_be_rounded(observed({2: (0.0, off * step, 2.0 * step)}, annotated)) is may
-    assert not plateaus.may_be_rounded(observed({}, annotated[:4]))
+        assert holds.may_be_rounded(observed({2: (0.0, off * step, 2.0 * step)}, annotated)) is may
+    assert not holds.may_be_rounded(observed({}, annotated[:4]))
     # Multiples of no step, and torques alone.
-    assert not plateaus.may_be_rounded(observed({}, annotated + 0.3))
-    assert not plateaus.may_be_rounded(observed({}, annotated * (0.0, 0.0, 1.0) + (0.0, 0.0, step)))
+    assert not holds.may_be_rounded(observed({}, annotated + 0.3))
+    assert not holds.may_be_rounded(observed({}, annotated * (0.0, 0.0, 1.0) + (0.0, 0.0, step)))
 
 
 def test_loads_of_which_none_held_were_not_rounded() -> None:
     """As those of a sweep."""
     none = np.zeros((0, 3))
-    found = plateaus.PlateauLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
+    found = holds.ImpliedLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
     assert found.annotated.shape == (0, 3)
-    assert not plateaus.may_be_rounded(found)
-    assert not plateaus.all_free(found, none)
+    assert not holds.may_be_rounded(found)
+    assert not holds.all_free(found, none)
 
 
 def world(
     applied: FloatArray, annotated: FloatArray, share: FloatArray, offset: float = 0.0, bend: float = 0.0
-) -> Callable[[FloatArray], PlateauLoads]:
+) -> Callable[[FloatArray], ImpliedLoads]:
     """Readings under loads that ``applied``, which effects change by a ``share`` and an ``offset``; what is simulated
     more than 5 N or N m off is told ``bend`` of what is beyond it too small.
     """
     effective = applied + applied @ share + offset
 
-    def asked(acting: FloatArray) -> PlateauLoads:
+    def asked(acting: FloatArray) -> ImpliedLoads:
         off = effective - acting[DWELL // 2 :: DWELL]
         off -= bend * np.sign(off) * np.maximum(np.abs(off) - 5.0, 0.0)
         return observed({}, annotated, everywhere=off)
@@ -380,10 +380,10 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
         annotated[k] = load
     slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
     asked = world(VARIED, annotated, slopes, offset, bend)
-    found = plateaus.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked)
-    assert [n.plateau.number for n in found] == sorted(wrong)
+    found = holds.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked)
+    assert [n.hold.number for n in found] == sorted(wrong)
     for one in found:
-        assert one.applied == pytest.approx(VARIED[one.plateau.number], abs=0.05)
+        assert one.applied == pytest.approx(VARIED[one.hold.number], abs=0.05)
         assert one.period == 1e-3
 
 
@@ -391,7 +391,7 @@ def test_right_notes_are_right_however_nonlinear_the_simulation() -> None:
     annotated = np.clip(VARIED, -5.0, 5.0)
     annotated[2] = (0.0, -80.0, 0.0)
     asked = world(annotated, annotated, np.zeros((3, 3)), offset=0.01, bend=0.8)
-    assert plateaus.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked) == []
+    assert holds.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked) == []
 
 
 ONE_TORQUE = np.array(
@@ -405,14 +405,14 @@ def test_doubled_only_torque_is_the_outlier() -> None:
     more = APPLIED_ONCE - ONE_TORQUE[4]
     for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
         off = tuple((more + allowed).tolist())
-        assert plateaus.outliers(observed({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
+        assert holds.outliers(observed({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
     # Another torque, and half of the torque alone: another unit or stiffness may make that.
-    assert plateaus.outliers(observed({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
-    assert plateaus.outliers(observed({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
+    assert holds.outliers(observed({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
+    assert holds.outliers(observed({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
     # The first load that was hung: half of it may be another unit, too.
     first = ONE_TORQUE.copy()
     first[3] = 0.0
-    assert plateaus.outliers(observed({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
+    assert holds.outliers(observed({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
 
 
 def test_applied_load_is_single_change_of_doubled_note() -> None:
@@ -420,12 +420,12 @@ def test_applied_load_is_single_change_of_doubled_note() -> None:
     listed = observed({4: (float(more[0]), float(more[1]), float(more[2]))}, ONE_TORQUE)
     annotated = np.repeat(ONE_TORQUE, DWELL, axis=0)
 
-    def asked(acting: FloatArray) -> PlateauLoads:
+    def asked(acting: FloatArray) -> ImpliedLoads:
         held = acting[DWELL // 2 :: DWELL]
         applied = ONE_TORQUE + listed.more
         return replace(listed, more=applied - held)
 
-    (note,) = plateaus.wrong_notes_against(annotated, 1e-3, asked)
+    (note,) = holds.wrong_notes_against(annotated, 1e-3, asked)
     assert note.exact
     assert note.applied.tolist() == APPLIED_ONCE.tolist()
     assert note.where == 'load 4'
@@ -433,7 +433,7 @@ def test_applied_load_is_single_change_of_doubled_note() -> None:
     assert words.endswith('(20.13 N, 0 N, 17.5 N m) hung, not (16 N, -20 N, 35 N m): note that')
     # One that others are like is what the readings say.
     other = observed({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
-    (free,) = plateaus.wrong_notes_against(
+    (free,) = holds.wrong_notes_against(
         annotated, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
     )
     assert not free.exact

@@ -57,7 +57,7 @@ CLOSES = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plateau:
+class Hold:
     """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
 
     ``number``: of the annotated change that began it, from 1; 0 before the first. ``unannotated``: nothing was noted
@@ -77,9 +77,9 @@ class Plateau:
         return np.asarray(loads[(self.first + self.last) // 2])
 
 
-def plateaus(
+def find_holds(
     rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, annotated_only: bool = False
-) -> list[Plateau]:
+) -> list[Hold]:
     """Return the times between changes of ``loads`` (n, 3), also between those that only the motion shows.
 
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: its index. ``annotated_only``: only between
@@ -99,13 +99,13 @@ def plateaus(
         last = int(stops[np.searchsorted(stops, first, side='right')])
         if (last - first) * period >= LONG_S:
             middle = loads[(first + last) // 2].copy()
-            out.append(Plateau(recording, first, last, number, alone, middle, last in unannotated))
+            out.append(Hold(recording, first, last, number, alone, middle, last in unannotated))
     return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlateauLoads:
-    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the annotated one, N, N,
+class ImpliedLoads:
+    """``more`` (k, 3): by what the load of each of the ``holds`` seems to differ from the annotated one, N, N,
     N m; 0 if there are no readings of it.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
@@ -115,7 +115,7 @@ class PlateauLoads:
     ``compliance`` (3,): m/N, m/N, rad/(N m). ``size``: samples of a fine block.
     """
 
-    plateaus: tuple[Plateau, ...]
+    holds: tuple[Hold, ...]
     more: FloatArray
     rest: FloatArray
     moved: FloatArray
@@ -127,7 +127,7 @@ class PlateauLoads:
     @property
     def annotated(self) -> FloatArray:
         """(k, 3) N, N, N m."""
-        return np.array([p.annotated for p in self.plateaus]).reshape(-1, 3)
+        return np.array([p.annotated for p in self.holds]).reshape(-1, 3)
 
     @property
     def sizes(self) -> FloatArray:
@@ -136,8 +136,8 @@ class PlateauLoads:
 
 
 def implied_loads(
-    rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Plateau]
-) -> PlateauLoads:
+    rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Hold]
+) -> ImpliedLoads:
     """Return the loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
 
     Of a recording of so many ``samples``, in means of ``size``, of which the share ``count`` (3P, m) is there.
@@ -160,10 +160,10 @@ def implied_loads(
     far = across[0] if len(across) == 1 else np.linalg.norm(across, axis=0)
     # What the first time has is an offset, which all have.
     moved = np.where(there, moved, np.nan)
-    return PlateauLoads(tuple(listed), more, rest, moved, beside, far, compliance, size)
+    return ImpliedLoads(tuple(listed), more, rest, moved, beside, far, compliance, size)
 
 
-def implied_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
+def implied_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Hold]], ImpliedLoads]:
     """Return the same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
     size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
     difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
@@ -178,15 +178,15 @@ def _mean(values: FloatArray) -> float:
     return float(there.mean()) if len(there) else 0.0
 
 
-def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> BoolArray:
+def _held(listed: Sequence[Hold], samples: int, size: int, blocks: int) -> BoolArray:
     inside = np.zeros(samples, dtype=bool)
     for p in listed:
         inside[p.first : p.last] = True
     return np.asarray(inside[: blocks * size].reshape(blocks, size).all(axis=1))
 
 
-def _pulses(rig: Rig, samples: int, listed: Sequence[Plateau], axis: int) -> list[FloatArray]:
-    """How the link moves, as a share, if a load acts in one of the plateaus after the first."""
+def _pulses(rig: Rig, samples: int, listed: Sequence[Hold], axis: int) -> list[FloatArray]:
+    """How the link moves, as a share, if a load acts in one of the holds after the first."""
     d, period = rig.dynamics, 1.0 / rig.converter.sample_rate_hz
     mode = (
         (d.torsion_frequency, d.torsion_damping_ratio) if axis == 2 else (d.bending_frequency, d.bending_damping_ratio)
@@ -202,19 +202,19 @@ def _pulses(rig: Rig, samples: int, listed: Sequence[Plateau], axis: int) -> lis
 
 @dataclass(frozen=True, slots=True)
 class StandingOut:
-    """``gone``: plateaus with another load than noted. ``softer``: the share by which effects may change the others."""
+    """``gone``: holds with another load than noted. ``softer``: the share by which effects may change the others."""
 
     gone: tuple[int, ...] = ()
     softer: float = 0.0
 
 
-def outliers(implied: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
-    """Return the few plateaus with another load than noted; none if it is none or are many.
+def outliers(implied: ImpliedLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
+    """Return the few holds with another load than noted; none if it is none or are many.
 
     ``bent``: share of what is wrong by which the others may seem to be, too. ``largest``: share by which an effect, a
     sign or another unit may change a load that no other is like.
     """
-    count = len(implied.plateaus)
+    count = len(implied.holds)
     if np.abs(implied.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not closes(implied, CLOSES + bent):
         return StandingOut()
     # A detector at fault moves its dots as no plate does.
@@ -242,7 +242,7 @@ def outliers(implied: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> 
     return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
 
 
-def is_known(implied: PlateauLoads, gone: IntArray, largest: float) -> bool:
+def is_known(implied: ImpliedLoads, gone: IntArray, largest: float) -> bool:
     """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much, or a
     change was noted twice.
     """
@@ -251,7 +251,7 @@ def is_known(implied: PlateauLoads, gone: IntArray, largest: float) -> bool:
     return bool(np.all(_alike(implied, gone) | far | twice))
 
 
-def _alike(implied: PlateauLoads, gone: IntArray) -> BoolArray:
+def _alike(implied: ImpliedLoads, gone: IntArray) -> BoolArray:
     """Of each of ``gone`` whether it is a sum of the other loads, nearly."""
     annotated = implied.annotated
     right = np.delete(annotated, gone, axis=0)
@@ -260,13 +260,13 @@ def _alike(implied: PlateauLoads, gone: IntArray) -> BoolArray:
     return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(outlying, axis=1))
 
 
-def _annotated_twice(implied: PlateauLoads, k: int) -> FloatArray | None:
-    """(3,): what hung in plateau ``k`` if the change that began it was noted twice; None if something else did.
+def _annotated_twice(implied: ImpliedLoads, k: int) -> FloatArray | None:
+    """(3,): what hung in hold ``k`` if the change that began it was noted twice; None if something else did.
 
     Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
     """
     annotated, before = implied.annotated[k], implied.annotated[k - 1]
-    if k == 0 or implied.plateaus[k].unannotated or not np.any(before != 0.0):
+    if k == 0 or implied.holds[k].unannotated or not np.any(before != 0.0):
         return None
     applied = 0.5 * (before + annotated)
     off = np.abs(implied.more[k] - (applied - annotated))
@@ -280,18 +280,18 @@ def are_outliers(wrong: FloatArray, remaining: FloatArray, bent: float) -> bool:
     return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
 
 
-def proportional_part(implied: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
+def proportional_part(implied: ImpliedLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
     """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest if it is a share of ``softer``."""
     if softer == 0.0:
         return np.zeros((3, 3)), np.zeros(3)
-    keep = np.setdiff1d(np.arange(len(implied.plateaus)), gone)
+    keep = np.setdiff1d(np.arange(len(implied.holds)), gone)
     x = np.column_stack((implied.annotated[keep], np.ones(len(keep))))
     prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
     both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ implied.more[keep]), dtype=np.float64)
     return both[:3], both[3]
 
 
-def deviation_in_tolerances(implied: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
+def deviation_in_tolerances(implied: ImpliedLoads, gone: Sequence[int], softer: float) -> FloatArray:
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
     slopes, offset = proportional_part(implied, gone, softer)
     off = np.abs(implied.more - implied.annotated @ slopes - offset)
@@ -299,17 +299,17 @@ def deviation_in_tolerances(implied: PlateauLoads, gone: Sequence[int], softer: 
     return np.asarray((off / allowed).max(axis=1))
 
 
-def all_free(implied: PlateauLoads, loads: FloatArray) -> bool:
+def all_free(implied: ImpliedLoads, loads: FloatArray) -> bool:
     """Return whether other loads than noted, at most of the times, leave next to nothing of the movement.
 
     ``loads`` (n, 3): as the movement of ``implied`` counts them; corrected ones differ from the annotated.
     """
-    if len(implied.plateaus) < FEWEST or not closes(implied):
+    if len(implied.holds) < FEWEST or not closes(implied):
         return False
     return int(np.count_nonzero(deviation_in_tolerances(implied, (), SOFTER) > 1.0)) >= 2 or are_rounded(implied, loads)
 
 
-def may_be_rounded(implied: PlateauLoads) -> bool:
+def may_be_rounded(implied: ImpliedLoads) -> bool:
     """Whether the noted forces are multiples of a whole step, and ``implied`` asks for others by less than a step."""
     held = implied.annotated[np.any(implied.annotated != 0.0, axis=1)]
     if len(held) < FEWEST:
@@ -318,11 +318,11 @@ def may_be_rounded(implied: PlateauLoads) -> bool:
     return 0.0 < forces < np.inf and bool(np.all(np.abs(implied.more[:, :2]) < forces))
 
 
-def are_rounded(implied: PlateauLoads, loads: FloatArray) -> bool:
+def are_rounded(implied: ImpliedLoads, loads: FloatArray) -> bool:
     """Whether the loads that ``implied`` asks for are the annotated ones before these were rounded; see
     :func:`rounded`.
     """
-    return rounded(implied.annotated, np.array([p.of(loads) for p in implied.plateaus]).reshape(-1, 3) + implied.more)
+    return rounded(implied.annotated, np.array([p.of(loads) for p in implied.holds]).reshape(-1, 3) + implied.more)
 
 
 def rounded(annotated: FloatArray, applied: FloatArray) -> bool:
@@ -354,7 +354,7 @@ def largest_step(annotated: FloatArray) -> float:
     return max((s for s in STEPS if np.allclose(annotated, s * np.round(annotated / s), atol=1e-6)), default=0.0)
 
 
-def closes(implied: PlateauLoads, share: float = CLOSES) -> bool:
+def closes(implied: ImpliedLoads, share: float = CLOSES) -> bool:
     """Return whether other loads, constant between changes, leave next to nothing of the movement."""
     return _rms(implied.rest) < share * _rms(implied.moved)
 
@@ -367,11 +367,11 @@ def _rms(part: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrongNote:
-    """A load that was noted wrong, or not at all: ``applied`` (3,) N, N, N m in ``plateau``. ``period``: s between
+    """A load that was noted wrong, or not at all: ``applied`` (3,) N, N, N m in ``hold``. ``period``: s between
     samples. ``exact``: from the other notes, not from the readings.
     """
 
-    plateau: Plateau
+    hold: Hold
     applied: FloatArray
     period: float
     exact: bool = False
@@ -379,12 +379,12 @@ class WrongNote:
     @property
     def name(self) -> str:
         """Of the finding."""
-        return 'missing_load' if self.plateau.unannotated else 'load_value'
+        return 'missing_load' if self.hold.unannotated else 'load_value'
 
     @property
     def where(self) -> str:
         """``load 3``, or when it was hung."""
-        p = self.plateau
+        p = self.hold
         return f'{p.first * self.period:.3f} s' if p.unannotated else f'load {p.number}'
 
     @property
@@ -395,7 +395,7 @@ class WrongNote:
     @property
     def off(self) -> FloatArray:
         """(3,): by what it differs from the annotated load, N, N, N m."""
-        return np.asarray(np.abs(self.applied - self.plateau.annotated))
+        return np.asarray(np.abs(self.applied - self.hold.annotated))
 
     @property
     def size(self) -> float:
@@ -404,7 +404,7 @@ class WrongNote:
 
     def words(self, name: str) -> str:
         """What was wrong, and what to do; ``name``: of the recording."""
-        p = self.plateau
+        p = self.hold
         return (
             f'{_begun(p, name)}: from {p.first * self.period:.3f} s to {p.last * self.period:.3f} s '
             f'({_worded(self.applied)}) hung, not ({_worded(p.annotated)}): note that'
@@ -417,23 +417,23 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
     they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
     """
-    listed = plateaus(rig, volts, loads)
+    listed = find_holds(rig, volts, loads)
 
-    def asked(acting: FloatArray) -> PlateauLoads:
+    def asked(acting: FloatArray) -> ImpliedLoads:
         return implied_beside_rig(rig, volts, acting)(listed)
 
     return wrong_notes_against(loads, 1.0 / rig.converter.sample_rate_hz, asked)
 
 
 def wrong_notes_against(
-    loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads], largest: float = ANY
+    loads: FloatArray, period: float, asked: Callable[[FloatArray], ImpliedLoads], largest: float = ANY
 ) -> list[WrongNote]:
     """Return the same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
 
     ``largest``: share by which effects may change a load; signs and units are right then.
     """
     first = asked(loads)
-    if not len(first.plateaus) or np.abs(first.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE:
+    if not len(first.holds) or np.abs(first.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE:
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
@@ -442,9 +442,9 @@ def wrong_notes_against(
     far = np.abs(readings_ask - annotated).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
     applied = np.where(far[:, None], readings_ask, annotated)
 
-    def against() -> PlateauLoads:
+    def against() -> ImpliedLoads:
         off = np.flatnonzero((applied != annotated).any(axis=1)).tolist()
-        implied = asked(as_applied(loads, [WrongNote(first.plateaus[k], applied[k], period) for k in off]))
+        implied = asked(as_applied(loads, [WrongNote(first.holds[k], applied[k], period) for k in off]))
         return replace(implied, more=implied.more + applied - annotated, moved=first.moved)
 
     implied = against()
@@ -461,7 +461,7 @@ def wrong_notes_against(
     for k in which.gone:
         # What effects do to a load that no other is like, the readings alone do not tell from the load.
         twice = None if _alike(implied, np.array([k]))[0] else _annotated_twice(implied, k)
-        out.append(WrongNote(first.plateaus[k], applied[k] if twice is None else twice, period, twice is not None))
+        out.append(WrongNote(first.holds[k], applied[k] if twice is None else twice, period, twice is not None))
     return out
 
 
@@ -469,11 +469,11 @@ def as_applied(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
     """``loads`` (n, 3) with what hung in place of what was noted."""
     out = loads.copy()
     for note in wrong:
-        out[note.plateau.first : note.plateau.last] = note.applied
+        out[note.hold.first : note.hold.last] = note.applied
     return out
 
 
-def _begun(p: Plateau, name: str) -> str:
+def _begun(p: Hold, name: str) -> str:
     if not p.unannotated:
         return f'the {ordinal(p.number)} load of {name} was noted wrong'
     after = f' after the {ordinal(p.number)} annotated load' if p.number else ''
