@@ -160,4 +160,4 @@ def measured(volts: Sequence[Volts], samples: Sequence[FloatArray]) -> list[Bloc
         (v == v[0]).all(axis=0).reshape(blocks, channels // 3, 3).all(axis=2).tolist(),
         level.tolist(),
     )
-    return [BlockMeasures(*own) for own in zip(volts, samples, *columns, strict=True)]
+    return [BlockMeasures(*row) for row in zip(volts, samples, *columns, strict=True)]

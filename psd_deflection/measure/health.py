@@ -155,7 +155,7 @@ class OpticsHealth:
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
         self._radius = tuple(psd.spot_radius for psd in rig.psds for _ in range(2))
         # If the noise is below one step, constant values are normal.
-        self._moves = [bool((own > step).any()) for own in rig.noises]
+        self._moves = [bool((noise > step).any()) for noise in rig.noises]
         self._noise = (NOISY * np.sqrt(rig.noises**2 + step**2 / 12.0)).tolist()
 
     def still(self, measures: BlockMeasures) -> tuple[bool, ...]:
@@ -258,9 +258,9 @@ class OpticsHealth:
         out = []
         if len(measures.volts) == self._size >= 10:
             for psd in range(1, self._psds + 1):
-                own = measures.rough[3 * psd - 3 : 3 * psd]
-                noisy = psd not in faulty and any(map(gt, own, self._noise[psd - 1]))
-                usual = loudness.take(psd, own, noisy)
+                rough = measures.rough[3 * psd - 3 : 3 * psd]
+                noisy = psd not in faulty and any(map(gt, rough, self._noise[psd - 1]))
+                usual = loudness.take(psd, rough, noisy)
                 if noisy:
                     out.append(f'psd_{psd} is noisy: {max(usual) * 1e3:.1f} mV a sample')
         if not self.rejects_frozen:

@@ -82,7 +82,7 @@ class PipelineCounters:
 
 
 class Pipeline:
-    """Samples in, records out. ``misfits``: a message for each state of the last change that this rig cannot restore.
+    """Samples in, records out. ``mismatches``: a message for each state of the last change this rig cannot restore.
 
     Raises SolverError or ConfigError if the rig cannot be solved.
     """
@@ -97,7 +97,7 @@ class Pipeline:
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self.zero_rejected = ''
         self._end_ns: int | None = None
-        self.misfits: list[str] = []  # Bound: one a part of the rig.
+        self.mismatches: list[str] = []  # Bound: one a part of the rig.
         self._changes = 0
         self._begin(rig)
 
@@ -224,7 +224,7 @@ class Pipeline:
     def apply(self, change: ParameterChange) -> None:
         """Use the changed values from now on, and go on from the state that it names.
 
-        Raises ConfigError if a parameter is out of bounds; then nothing has changed. ``misfits`` has a line for each
+        Raises ConfigError if a parameter is out of bounds; then nothing has changed. ``mismatches`` has a line for each
         value that fits no part of this rig; it is left out.
         """
         self._changes += 1
@@ -238,7 +238,7 @@ class Pipeline:
             self._begin(self.rig)
         if reported:
             self._change_rig(reported)
-        self.misfits = load_states(self._parts, memory)
+        self.mismatches = load_states(self._parts, memory)
         if self.motion_filter is not None:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
             self._apply_load(self.motion_filter, load)
@@ -264,7 +264,7 @@ class Pipeline:
         try:
             load = numbers(reported, KNOWN_LOAD, 'seconds, nanoseconds and a load', 5)
         except ValueError as error:
-            self.misfits.append(str(error))
+            self.mismatches.append(str(error))
             return
         if load is not None:
             motion.load(AppliedLoad(joined_ns(load[0], load[1]), load[2], load[3], load[4]))
@@ -352,13 +352,13 @@ class Pipeline:
                 yield self._environment_change(first.index, {START: float(first.t_ns[0])})
             changes = self._changes
             volts = [self._calibration.observed(block.volts) for block in blocks]
-            samples = [self._dots(block, own) for block, own in zip(blocks, volts, strict=True)]
+            samples = [self._dots(block, block_volts) for block, block_volts in zip(blocks, volts, strict=True)]
             measures = measured(volts, samples)
             observed = list(self._classified(blocks, measures))
             readings = self.estimation.fit(observed)
             done = 0
-            for own in zip(blocks, measures, observed, readings, strict=True):
-                yield from self._block(*own)
+            for inputs in zip(blocks, measures, observed, readings, strict=True):
+                yield from self._block(*inputs)
                 done += 1
                 if self._changes != changes:
                     # The others were fitted with what no longer holds.
@@ -407,16 +407,16 @@ class Pipeline:
         size = self._cutter.block_size
         seq, t_ns = np.array([block.seq for block in blocks]), np.array([block.t_ns for block in blocks])
         middles = middles_ns(seq, t_ns, size, self._period_ns)
-        for block, own, slots, middle in zip(blocks, measures, seq % size, middles, strict=True):
-            frozen = self._optics.frozen(frozen, own)
+        for block, block_measures, slots, middle in zip(blocks, measures, seq % size, middles, strict=True):
+            frozen = self._optics.frozen(frozen, block_measures)
             yield BlockInput(
                 t_ns=middle,
                 index=block.index,
                 slots=slots,
-                samples=own.samples,
-                means=own.means,
-                mean_sums=own.mean_sums,
-                verdict=self._optics.classify(block, own, frozen),
+                samples=block_measures.samples,
+                means=block_measures.means,
+                mean_sums=block_measures.mean_sums,
+                verdict=self._optics.classify(block, block_measures, frozen),
                 frozen=frozen,
                 fully_published=block.index % self.rig.estimator.decimation == 0,
             )

@@ -83,20 +83,20 @@ class ReadingsRun:
         return self._answers[number][at]
 
     def _solve(self, numbers: Iterable[int]) -> None:
-        found: list[tuple[int, Solver, list[Solution], FloatArray]] = []
+        solved: list[tuple[int, Solver, list[Solution], FloatArray]] = []
         for number in numbers:
             solver = self._solvers.of(number, self.psds.psds)
             if solver is None:
                 failed = SolverAnswer(None, f'{self._solvers.names[number]}: takes all PSDs')
                 self._answers[number] = [failed] * len(self.dots)
             else:
-                found.append((number, solver, *self._solutions(solver)))
-        if not found:
+                solved.append((number, solver, *self._solutions(solver)))
+        if not solved:
             return
-        gains = np.array([own for *_, own in found])
+        gains = np.array([gain for *_, gain in solved])
         # Of all solvers at once: of so few numbers the calls cost most.
         noises = FIXED.einsum('sbic,bck,sbjk->sbij', gains, self.covariance, gains)
-        for (number, solver, solutions, gain), noise in zip(found, noises, strict=True):
+        for (number, solver, solutions, gain), noise in zip(solved, noises, strict=True):
             self._answers[number] = [
                 self._answer(number, solver, at, solution, gain[at], noise[at]) for at, solution in enumerate(solutions)
             ]
@@ -105,14 +105,14 @@ class ReadingsRun:
         """The solutions and their gains (B, 3, C), 0 of those without."""
         variances = self.variances
         if len(self.dots) == 1:
-            one = solver.solve(self.dots[0], variances)
-            return [one], self._gain(solver, 0, one)[None]
+            solution = solver.solve(self.dots[0], variances)
+            return [solution], self._gain(solver, 0, solution)[None]
         dots = np.array(self.dots)
-        found = solver.solve_many(dots, np.array(variances))
-        solutions = found.rows()
+        batch = solver.solve_many(dots, np.array(variances))
+        solutions = batch.rows()
         if all(map(_has_gain, solutions)):
-            return solutions, solver.gain_many(dots, variances, found)
-        return solutions, np.array([self._gain(solver, at, one) for at, one in enumerate(solutions)])
+            return solutions, solver.gain_many(dots, variances, batch)
+        return solutions, np.array([self._gain(solver, at, solution) for at, solution in enumerate(solutions)])
 
     def _gain(self, solver: Solver, at: int, solution: Solution) -> FloatArray:
         """(3, C): of a solution of block ``at``, 0 if it has none."""

@@ -59,10 +59,10 @@ def load_states(parts: Iterable[Part], values: Mapping[str, Value]) -> list[str]
     rest = dict(values)
     lines = []
     for part in parts:
-        own = {name: rest.pop(name) for name in values if name in rest and name.startswith(part.prefixes)}
+        part_values = {name: rest.pop(name) for name in values if name in rest and name.startswith(part.prefixes)}
         try:
-            if own:
-                part.load_state_dict(own)
+            if part_values:
+                part.load_state_dict(part_values)
         except ValueError as error:
             lines.append(f'{part.part} does not go on from what was recorded: {error}')
     return [*lines, *(f'{name}: no part of this rig remembers such a value; it is left out' for name in rest)]

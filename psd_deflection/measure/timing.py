@@ -176,15 +176,15 @@ class ClockMap:
 
         What was observed since then is forgotten.
         """
-        by, before = by_us * 1000, before_us * 1000
-        self._origin += by
-        self._anchor_device += by
-        self._mapped += by if self._mapped <= before else 0
-        self._minima = [(device + by, delay - by) for device, delay in self._minima if device <= before]
+        jump, before = by_us * 1000, before_us * 1000
+        self._origin += jump
+        self._anchor_device += jump
+        self._mapped += jump if self._mapped <= before else 0
+        self._minima = [(device + jump, delay - jump) for device, delay in self._minima if device <= before]
         if self._bucket_min is not None:
             device, delay = self._bucket_min
-            self._bucket_min = (device + by, delay - by) if device <= before else None
-        self.stepped_ns -= by
+            self._bucket_min = (device + jump, delay - jump) if device <= before else None
+        self.stepped_ns -= jump
 
     def host_ns(self, t_device_us: int) -> int:
         """Where the map has this device time now."""
@@ -238,14 +238,14 @@ class ClockMap:
             skew, intercept = lower_line([(d - self._origin, y) for d, y in self._minima])
         self._skew = skew
         # The slope changes at the last stamp that was returned, so the map stays continuous.
-        turn = max(self._mapped, self._anchor_device)
-        target = turn + intercept + skew * (turn - self._origin)
-        host = self._host(turn)
+        anchor = max(self._mapped, self._anchor_device)
+        target = anchor + intercept + skew * (anchor - self._origin)
+        host = self._host(anchor)
         error = target - host
         self._residual = error
         settling = now - self._origin < SETTLING_S * SECOND_NS or abs(error) > FAR_NS
         steer = min(max(error / (1.0 if settling else 5.0) / SECOND_NS, -STEER_SETTLING), STEER_SETTLING)
-        self._anchor_device, self._anchor_host, self._slope = turn, host, skew + steer
+        self._anchor_device, self._anchor_host, self._slope = anchor, host, skew + steer
 
     def _stray(self) -> tuple[float, float] | None:
         """Slope and intercept if the clock is evidently worse than ``MAX_SKEW``."""

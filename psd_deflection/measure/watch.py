@@ -259,7 +259,7 @@ class Watch:
         """Forget the alarm and all levels, and take the detector centres and zeros from ``rig``."""
         self._centers, beams = rig.centers.tolist(), (rig.centers + rig.zeros).tolist()
         self._beam_distances = [
-            math.sqrt((ax - bx) ** 2 + (ay - by) ** 2) for (ax, ay), (bx, by) in itertools.combinations(beams, 2)
+            math.sqrt((x1 - x2) ** 2 + (y1 - y2) ** 2) for (x1, y1), (x2, y2) in itertools.combinations(beams, 2)
         ]
         self._reach = max(math.hypot(x, y) for x, y in self._centers)  # Movement of the outermost PSD per twist, m/rad.
         for channel in self._channels:

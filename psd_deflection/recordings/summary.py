@@ -33,7 +33,7 @@ class RecordedVibration:
         self._xp = xp
         self._calibration = VoltsToDots.from_rig(rig)
         self._combinations = combinations_of(rig.centers, rig.centers + rig.zeros, xp=xp)
-        self._turn = self._combinations.turn[: self._combinations.moving]
+        self._moving = self._combinations.matrix[: self._combinations.moving]
         self._light = rig.estimator.sum_min
         self._volt = rig.sensitivities.mean(axis=1)
         self._channels = 3 * len(rig.psds)
@@ -75,7 +75,7 @@ class RecordedVibration:
             return
         places, dots, sums = (np.concatenate(part) for part in zip(*samples, strict=True))
         still = np.column_stack((self._combinations.fixed(dots), sums))
-        tones = self._search.tones(places, dots, still, self._turn).moving
+        tones = self._search.tones(places, dots, still, self._moving).moving
         self.seconds += 1
         self._shaken += bool(tones)
         self._loudest = max((*((self._loudest,) if self._loudest else ()), *tones), key=rms_of, default=None)

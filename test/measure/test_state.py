@@ -56,7 +56,7 @@ def test_every_value_belongs_to_one_part_and_comes_back() -> None:
     assert memory is not None
     other = Pipeline(rig)
     other.apply(memory)
-    assert other.misfits == []
+    assert other.mismatches == []
     again = other.memory(rig)
     assert again is not None
     reported = dict(memory.values)
@@ -74,7 +74,7 @@ def test_a_value_that_does_not_fit_is_named_with_its_part(name: str, value: floa
     wrong = {**dict(memory.values), name: value}
     pipeline = Pipeline(rig)
     pipeline.apply(ParameterChange(memory.t_ns, memory.block, tuple(wrong.items())))
-    (message,) = pipeline.misfits
+    (message,) = pipeline.mismatches
     assert 'does not go on from what was recorded' in message
     assert list(pipeline.process(chunk(rig, 2)))
 
@@ -82,10 +82,10 @@ def test_a_value_that_does_not_fit_is_named_with_its_part(name: str, value: floa
 def test_a_value_of_no_part_is_named() -> None:
     pipeline = Pipeline(load_rig())
     pipeline.apply(ParameterChange(0, 0, (('state.motion', (1.0,)), ('state.psds.0_2', (1.0,)))))
-    assert any('state.motion: no part of this rig remembers such a value' in message for message in pipeline.misfits)
-    assert any('two or more of 2 PSDs' in message for message in pipeline.misfits)
+    assert any('state.motion: no part of this rig remembers such a value' in message for message in pipeline.mismatches)
+    assert any('two or more of 2 PSDs' in message for message in pipeline.mismatches)
     pipeline.apply(ParameterChange(0, 0, ((ENVIRONMENT[0], 'noon'),)))
-    assert 'expected a number' in pipeline.misfits[0]
+    assert 'expected a number' in pipeline.mismatches[0]
     assert load_states((), {}) == []
 
 
@@ -197,7 +197,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(label: str) -> None:
         expected, again, other = (
             reported(p.process(streams.chunk(volts[20 * start :], 20 * start))) for p in (live, replay, without)
         )
-        assert replay.misfits == []
+        assert replay.mismatches == []
         assert again == expected, start
         assert other != expected, start
 
@@ -295,7 +295,7 @@ def test_a_memory_of_another_length_is_left_out_and_reported(name: str, value: t
     rig = load_rig(overrides={'filter': 'modal', 'degraded': 'hold'})
     pipeline, fresh = Pipeline(rig), Pipeline(rig)
     pipeline.apply(ParameterChange(0, 0, ((name, value),)))
-    (message,) = pipeline.misfits
+    (message,) = pipeline.mismatches
     assert f'{name}: {len(value)} numbers; expected ' in message
     assert pipeline.memory(rig) == fresh.memory(rig)
     assert pipeline.estimation.zero_variances == ()

@@ -94,9 +94,9 @@ class Inertia:
             raise ValueError(f'{MOST_REPORTED} accelerations wait already for their samples')
         self.count += 1
         self.late += new.t_ns < there_ns
-        (bx, by, _), (ax, ay, az) = new.linear, new.angular
-        deflection = self._gives * (bx + self._length * ay, by - self._length * ax, az)
-        there = bisect.bisect_left(self.reported, new.t_ns, key=lambda one: one[0])
+        (x, y, _), (ax, ay, az) = new.linear, new.angular
+        deflection = self._gives * (x + self._length * ay, y - self._length * ax, az)
+        there = bisect.bisect_left(self.reported, new.t_ns, key=lambda entry: entry[0])
         same = there < len(self.reported) and self.reported[there][0] == new.t_ns
         self.reported[there : there + same] = [(new.t_ns, tuple(deflection.tolist()))]
 
@@ -125,7 +125,7 @@ class Inertia:
         If it changes there evenly, or by a step at any one time, the velocity is off by a tenth of the change times
         that time, root mean square, at three quarters of it; at its end by nothing.
         """
-        there = bisect.bisect_right(self.reported, t_ns, key=lambda one: one[0])
+        there = bisect.bisect_right(self.reported, t_ns, key=lambda entry: entry[0])
         if there < 2:
             return np.zeros(3)
         (before_ns, before), (now_ns, now) = self.reported[there - 2 : there]

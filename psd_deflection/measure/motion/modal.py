@@ -47,9 +47,9 @@ class Oscillator:
         root = math.sqrt(1.0 - xp.square(zeta))
         decay = xp.exp(-zeta * w * seconds)
         c, s = xp.cos(root * w * seconds), xp.sin(root * w * seconds) / root
-        kept, out_of_phase = decay * (c + zeta * s), decay * s
+        in_phase, out_of_phase = decay * (c + zeta * s), decay * s
         out = np.zeros((4, 4))
-        out[:2, :2] = [[kept, out_of_phase], [-out_of_phase, decay * (c - zeta * s)]]
+        out[:2, :2] = [[in_phase, out_of_phase], [-out_of_phase, decay * (c - zeta * s)]]
         out[:, 2:] = self.pushed(np.array([seconds]))[0].T
         return out
 
@@ -60,10 +60,10 @@ class Oscillator:
         since = np.maximum(seconds, 0.0)
         decay = xp.exp_many(-zeta * w * since)
         c, s = xp.cos_many(root * w * since), xp.sin_many(root * w * since) / root
-        zero, one = np.zeros(len(since)), np.ones(len(since))
+        zeros, ones = np.zeros(len(since)), np.ones(len(since))
         rest = 1.0 - decay * (c + zeta * s)
         lag = 2.0 * zeta - decay * (2.0 * zeta * c + (2.0 * xp.square(zeta) - 1.0) * s)
-        out = np.array([[rest, decay * s, one, zero], [w * since - lag, rest, w * since, one]]).transpose(2, 0, 1)
+        out = np.array([[rest, decay * s, ones, zeros], [w * since - lag, rest, w * since, ones]]).transpose(2, 0, 1)
         return np.asarray(np.where(seconds[:, None, None] >= 0.0, out, 0.0))
 
     def added_covariance(self, seconds: FloatArray) -> FloatArray:
@@ -84,9 +84,9 @@ class BlockGains(NamedTuple):
     """What n samples of a block say; A axes, K rates. S: their covariance if x0 is known, X: that of x_end with them.
 
     ``observed`` (A, n, 4): O. ``precision`` (A, K, n, n): S^-1. ``pulled`` (A, K, 4, n): O^T S^-1. ``smoothed``
-    (A, K, 4, n): X S^-1. ``information`` (A, K, 4, 4): O^T S^-1 O, of x0. ``kept`` (A, K, 4, 4): x_end for x0, with the
-    samples given. ``residual`` (A, K, 4, 4): covariance of x_end if x0 and the samples are known. ``log_size`` (A, K):
-    log det S.
+    (A, K, 4, n): X S^-1. ``information`` (A, K, 4, 4): O^T S^-1 O, of x0. ``transition`` (A, K, 4, 4): x_end for x0,
+    with the samples given. ``residual`` (A, K, 4, 4): covariance of x_end if x0 and the samples are known. ``log_size``
+    (A, K): log det S.
     """
 
     observed: FloatArray
@@ -94,7 +94,7 @@ class BlockGains(NamedTuple):
     pulled: FloatArray
     smoothed: FloatArray
     information: FloatArray
-    kept: FloatArray
+    transition: FloatArray
     residual: FloatArray
     log_size: FloatArray
 

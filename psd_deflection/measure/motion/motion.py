@@ -159,19 +159,19 @@ class ModalFilter:
         """``gamma`` (C, C, N), m^2: covariance of reading c with reading d, so many samples later."""
         rotated = self._xp.einsum('ac,cdl,bd->abl', self._gain, gamma, self._gain)
         lags = np.arange(self._size)[:, None] - np.arange(self._size)
-        behind = np.where(lags >= 0, rotated.transpose(1, 0, 2)[..., np.abs(lags)], rotated[..., np.abs(lags)])
-        own = behind[range(3), range(3)]
-        self._noise = behind[_FIRST, _SECOND]
+        toeplitz = np.where(lags >= 0, rotated.transpose(1, 0, 2)[..., np.abs(lags)], rotated[..., np.abs(lags)])
+        noise = toeplitz[range(3), range(3)]
+        self._noise = toeplitz[_FIRST, _SECOND]
         rates = self._stated
         if rates is None:
             seconds = self._size * self._period
             rates = np.zeros((3, self.levels, 2))
-            steps = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._xp.power_many(STEP, np.arange(STEPPED)))
-            smooth = own[:, 0, 0, None] / seconds * np.square(SMALLEST * self._xp.power_many(STEP, np.arange(SMOOTH)))
+            steps = noise[:, 0, 0, None] / seconds * np.square(SMALLEST * self._xp.power_many(STEP, np.arange(STEPPED)))
+            smooth = noise[:, 0, 0, None] / seconds * np.square(SMALLEST * self._xp.power_many(STEP, np.arange(SMOOTH)))
             rates[:, :STEPPED, 0] = steps
             rates[:, STEPPED:, 1] = smooth / (self._w[:, None] * seconds) ** 2
         self._rates = rates
-        self._tables.fill(own, rates)
+        self._tables.fill(noise, rates)
 
     def is_new(self, load: AppliedLoad) -> bool:
         """Whether ``load`` differs from the last one that was reported."""
@@ -263,12 +263,12 @@ class ModalFilter:
         """
         came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late
         taken = self._taken
-        kept = self._xp.exp(-self._size * self._period / LATE_S)
-        self._late = kept * self._late if taken is not None else np.zeros((3, 2))
+        decay = self._xp.exp(-self._size * self._period / LATE_S)
+        self._late = decay * self._late if taken is not None else np.zeros((3, 2))
         if taken is None or not came or (now := self._forced(self._t_ns)) is None:
             return
         more = now.at - taken.forced.at
-        self._late += (1.0 - kept) * np.square(more[:, -1, :2])
+        self._late += (1.0 - decay) * np.square(more[:, -1, :2])
         self._x = self._x + more[:, -1] - self._xp.einsum('ain,an->ai', taken.gain, more[..., 0])
         self._swung = self._swung + more[:, -1]
         self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
@@ -309,21 +309,21 @@ class ModalFilter:
         log_weights = self._xp.log_many(prior) - 0.5 * (size + squares)
         weights = self._xp.exp_many(log_weights - log_weights.max(axis=1, keepdims=True))
         weights /= self._xp.sum(weights, 1)[:, None]
-        carried = self._xp.einsum('akij,akjl->akil', gains.kept, posterior)
-        found = after[:, None] + self._xp.einsum('akin,an->aki', gains.smoothed, miss)
-        found += self._xp.einsum('akij,akj->aki', carried, score)
-        covariance = self._xp.einsum('akij,aklj->akil', carried, gains.kept) + gains.residual
-        self._x = self._xp.einsum('ak,aki->ai', weights, found)
-        apart = found - self._x[:, None]
+        carried = self._xp.einsum('akij,akjl->akil', gains.transition, posterior)
+        estimates = after[:, None] + self._xp.einsum('akin,an->aki', gains.smoothed, miss)
+        estimates += self._xp.einsum('akij,akj->aki', carried, score)
+        covariance = self._xp.einsum('akij,aklj->akil', carried, gains.transition) + gains.residual
+        self._x = self._xp.einsum('ak,aki->ai', weights, estimates)
+        apart = estimates - self._x[:, None]
         total = covariance + apart[..., :, None] * apart[..., None, :]
         self._p = self._xp.einsum('ak,akij->aij', weights, total)
         self._p = 0.5 * (self._p + self._p.transpose(0, 2, 1))
         mean = self._xp.einsum('ak,akin->ain', weights, gains.smoothed)
         mean += self._xp.einsum('akij,akjn->ain', weights[..., None, None] * carried, gains.pulled)
-        own = self._tables.phi - self._xp.einsum('ain,anj->aij', mean, gains.observed)
+        transition = self._tables.phi - self._xp.einsum('ain,anj->aij', mean, gains.observed)
         noise = self._noise[:, slots[:, None], slots]
         both = self._xp.einsum('pin,pnm->pim', mean[_FIRST], noise)
-        self._shared = self._xp.einsum('pij,pjl,pml->pim', own[_FIRST], self._shared, own[_SECOND])
+        self._shared = self._xp.einsum('pij,pjl,pml->pim', transition[_FIRST], self._shared, transition[_SECOND])
         self._shared += self._xp.einsum('pim,pjm->pij', both, mean[_SECOND])
         self._weights = weights
         self.coasted = 0.0

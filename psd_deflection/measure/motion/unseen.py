@@ -56,7 +56,7 @@ class UnseenLoads:
             [mode.added_covariance(seconds * self._spans).diagonal(0, 2, 3) for mode in modes], axis=1
         )
         self._xp = modes[0].xp
-        self._kept = self._xp.exp(-seconds / LATELY)
+        self._decay = self._xp.exp(-seconds / LATELY)
         self.variances = np.zeros((len(modes), len(spans), 4))
         self._x = np.zeros((spans[-1] + 1, len(modes), 4))
         self._p = np.zeros((spans[-1] + 1, len(modes), 4, 4))
@@ -94,7 +94,7 @@ class UnseenLoads:
 
     def add(self, x: FloatArray, p: FloatArray, rate: FloatArray) -> None:
         """The state after a block with samples: mean (A, 4), covariance (A, 4, 4), process noise (A, 2)."""
-        self.variances *= self._kept
+        self.variances *= self._decay
         there = self._spans[self._spans <= self._buffered]
         if len(there):
             count = len(there)

@@ -94,14 +94,14 @@ class ConverterSteps:
             times = apart / self._divisor
             fits = np.abs(times - np.rint(times)) * self._divisor <= rounding
         for channel in np.flatnonzero(~fine & ~fits.all(axis=0)).tolist():
-            own = float(self._divisor[channel])
+            divisor = float(self._divisor[channel])
             for value in np.unique(apart[:, channel]).tolist():
-                own = _common(own, value, float(rounding[channel]))
+                divisor = _common(divisor, value, float(rounding[channel]))
             # Not many times the rounding of float32, it is none.
             least = max(_FINE * self._step, 8.0 * _ROUNDING * float(np.abs(levels[:, channel]).max()))
-            self._divisor[channel] = own if own == 0.0 or own > least else self._step
+            self._divisor[channel] = divisor if divisor == 0.0 or divisor > least else self._step
         before = self.steps
-        self.steps = self._found()
+        self.steps = self._find_steps()
         self._all_fine = bool(self._fine.all())
         return not np.array_equal(before, self.steps)
 
@@ -116,13 +116,13 @@ class ConverterSteps:
         if len(values) != 3 * len(self.steps):
             raise ValueError(f'steps of {len(self.steps)} channels have {3 * len(self.steps)} values')
         self._first, self._divisor, self._off = np.reshape(values, (3, -1)).copy()
-        self.steps = self._found()
+        self.steps = self._find_steps()
         self._all_fine = bool(self._fine.all())
 
     def _tolerance(self, volts: FloatArray) -> FloatArray:
         return np.asarray(np.maximum(_OFF * self._step, _ROUNDING * np.abs(volts).max(axis=0)))
 
-    def _found(self) -> FloatArray:
+    def _find_steps(self) -> FloatArray:
         fine = self._fine
         reported = (self._divisor > 0.0) & ~fine & (self._divisor <= self._coarsest) & (self._off >= BELIEVED)
         out = np.where(reported, self._divisor, 0.0)
@@ -134,13 +134,13 @@ class ConverterSteps:
         return out
 
     def _of_levels(self) -> float:
-        own = 0.0
+        divisor = 0.0
         levels = np.abs(self._first)
         if np.count_nonzero(levels > 0.0) < _LEVELS:
             return 0.0
         for value in (*levels.tolist(), *self._divisor.tolist()):
-            own = _common(own, value, float(self._tolerance(levels[None, :]).max()))
-        return own if _FINE * self._step <= own <= self._coarsest else 0.0
+            divisor = _common(divisor, value, float(self._tolerance(levels[None, :]).max()))
+        return divisor if _FINE * self._step <= divisor <= self._coarsest else 0.0
 
 
 def _common(a: float, b: float, within: float) -> float:
@@ -160,7 +160,7 @@ VIBRATION, HUM, STEPS, PSDS = 'state.vibration', 'state.hum', 'state.converter_s
 class BlockEstimator:
     """Fits, checks and learns from block after block.
 
-    ``full``: all PSDs. ``contradictions``: inconsistent blocks. ``misfits``: blocks with motion that the fit cannot
+    ``full``: all PSDs. ``contradictions``: inconsistent blocks. ``poor_fits``: blocks with motion that the fit cannot
     follow. ``chi_square``: of the last check, of ``freedom`` degrees. ``excluded``: PSDs (from 1) without which the
     last block was solved. ``vibrating``: the tones that the last block could not follow. ``on_plate``: whether the PSDs
     are on the plate: then the noise is measured, and the readings checked.
@@ -190,7 +190,7 @@ class BlockEstimator:
         self.freedom = 1
         self.contradictions = 0
         self.chi_square = 0.0
-        self.misfits = 0
+        self.poor_fits = 0
         self.vibrating: tuple[Tone, ...] = ()
         self._use_noise()
 
@@ -211,19 +211,19 @@ class BlockEstimator:
 
     def subset(self, psds: tuple[int, ...], tilts: Tilts) -> PsdSet:
         """Return the set of ``psds`` (from 0), two or more; ``tilts``: as of :class:`PsdSet`."""
-        own = self._subsets.get(psds)
-        if own is None:
-            own = self._subsets[psds] = PsdSet(self._rig, psds, tilts)
-            own.set_noise(self.noise)
+        psd_set = self._subsets.get(psds)
+        if psd_set is None:
+            psd_set = self._subsets[psds] = PsdSet(self._rig, psds, tilts)
+            psd_set.set_noise(self.noise)
             if psds in self._pending:
-                own.load_state(self._pending.pop(psds))
-        return own
+                psd_set.load_state(self._pending.pop(psds))
+        return psd_set
 
     def record(self, fitted: FittedBlock | None, excluded: tuple[int, ...]) -> None:
         """Take what the last block was solved from: its fit, None without one, and the PSDs (from 1) not used."""
         self.excluded, self.vibrating = excluded, ()
         if fitted is not None:
-            self.misfits += fitted.misfit
+            self.poor_fits += fitted.poor_fit
             self.vibrating = tuple(self.noise.tones[i] for i in fitted.vibrating)
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
@@ -236,9 +236,9 @@ class BlockEstimator:
         """Factor on the limits of the checks."""
         return 1.0 if self.noise.measured or not self.on_plate else UNMEASURED
 
-    def check(self, psds: PsdSet, found: Unexplained | None, blamed: Collection[int] | None) -> ConsistencyResult:
+    def check(self, psds: PsdSet, unexplained: Unexplained | None, blamed: Collection[int] | None) -> ConsistencyResult:
         """Check the readings of a block and update the check's state; as :meth:`ConsistencyCheck.update`."""
-        result = psds.check.update(found, self.limit_factor, blamed)
+        result = psds.check.update(unexplained, self.limit_factor, blamed)
         self.contradictions += result.contradict
         self.chi_square, self.freedom = result.chi_square, result.freedom
         return result
@@ -302,7 +302,7 @@ class BlockEstimator:
             ('chi-square of the readings', f'{self.chi_square:.2f}{freedom}'),
             ('p of that chi-square', f'{share:.2g}'),
             ('blocks whose readings contradict each other', str(self.contradictions)),
-            ('blocks with motion that the fit cannot follow', str(self.misfits)),
+            ('blocks with motion that the fit cannot follow', str(self.poor_fits)),
         )
         if not self.on_plate:
             return (*rows, ('covariance from', 'noise of the rig file'))
@@ -340,7 +340,7 @@ class BlockEstimator:
             rows |= {SUMS: self.noise.sums(), STEPS: self._converter.state()}
             out |= {name: row for name, row in rows.items() if row}
         sets = {self.full.psds: self.full, **self._subsets}
-        states = {**self._pending, **{psds: own.state() for psds, own in sets.items()}}
+        states = {**self._pending, **{psds: psd_set.state() for psds, psd_set in sets.items()}}
         return out | {PSDS + '_'.join(map(str, psds)): state for psds, state in states.items()}
 
     def load_state_dict(self, values: Mapping[str, Value]) -> None:

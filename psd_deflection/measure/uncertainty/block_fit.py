@@ -57,7 +57,7 @@ _LASTING_BIAS = 0.03
 _SUDDEN = 16.0
 """c_k^2 over what the blocks before let expect of it, above which this block alone says how much motion there is."""
 
-_MISFIT = 5.0
+_POOR_FIT = 5.0
 """Standard deviations of the sum of squares that is left, above which the polynomial does not fit."""
 
 _CONTRADICTED = 3.0
@@ -68,7 +68,7 @@ LARGEST = 64
 """Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
 
 _WIDEN = 1.0
-"""Times what is left of the samples: the standard deviation of a misfit's error in the middle."""
+"""Times what is left of the samples: the standard deviation of a poor fit's error in the middle."""
 
 
 class MotionMemory(NamedTuple):
@@ -81,12 +81,12 @@ class MotionMemory(NamedTuple):
 
 
 class FittedBlock(NamedTuple):
-    """``dots`` (C,) m at the stamp, their ``covariance`` (C, C) m^2, ``misfit``: the polynomial does not fit,
+    """``dots`` (C,) m at the stamp, their ``covariance`` (C, C) m^2, ``poor_fit``: the polynomial does not fit,
     ``vibrating``: which tones, from 0, are a share of ``MATTERS`` of the covariance, ``memory``: after this block."""
 
     dots: tuple[float, ...]
     covariance: FloatArray
-    misfit: bool
+    poor_fit: bool
     vibrating: tuple[int, ...]
     memory: MotionMemory
 
@@ -96,13 +96,13 @@ class FittedRun(NamedTuple):
 
     dots: list[tuple[float, ...]]
     covariance: FloatArray
-    misfit: list[bool]
+    poor_fit: list[bool]
     vibrating: list[tuple[int, ...]]
     memories: Sequence[MotionMemory]
 
     def block(self, at: int) -> FittedBlock:
         """Return the fit of block ``at`` (from 0)."""
-        return FittedBlock(self.dots[at], self.covariance[at], self.misfit[at], self.vibrating[at], self.memories[at])
+        return FittedBlock(self.dots[at], self.covariance[at], self.poor_fit[at], self.vibrating[at], self.memories[at])
 
 
 def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
@@ -176,12 +176,14 @@ def _terms(
     estimate = xp.einsum('ask,akj->asj', u[:, :, :reported], inverted)
     # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
     used = slice(2, reported, 2) if usual_v is None else slice(1, reported)
-    own, mixed = information[:, 0, 0], information[:, 0, used].T
-    share = mixed / own
+    mean_info, mixed = information[:, 0, 0], information[:, 0, used].T
+    share = mixed / mean_info
     rest = information[:, used, used].transpose(1, 2, 0) - share[:, None] * mixed
     right = middle[used, None] - share * middle[0]
     every = np.concatenate((u, estimate, precision), axis=2).transpose(1, 2, 0).copy()
-    return _Terms(q, u, information, v, sure, every, used, rest, right, middle[0] / own, share, inverted[:, 1:, 1:])
+    return _Terms(
+        q, u, information, v, sure, every, used, rest, right, middle[0] / mean_info, share, inverted[:, 1:, 1:]
+    )
 
 
 class BlockFit:
@@ -220,23 +222,23 @@ class BlockFit:
 
     def set_noise(self, gamma: FloatArray, tones: Sequence[Tone] = ()) -> None:
         """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings, and what vibrates."""
-        xp, turn = self._xp, self._combinations.turn
-        rotated = xp.einsum('ac,cdl,bd->abl', turn, gamma, turn)
+        xp, matrix = self._xp, self._combinations.matrix
+        rotated = xp.einsum('ac,cdl,bd->abl', matrix, gamma, matrix)
         # The covariance with an earlier sample is the transposed one with a later.
         both = np.concatenate((rotated.transpose(1, 0, 2)[:, :, :0:-1], rotated), axis=2)
         self._between = np.lib.stride_tricks.sliding_window_view(both, self._size, axis=2)[:, :, :, ::-1]
-        own = rotated[self._diagonal, self._diagonal]
-        self._precision = _precision(own, white=self._size > LARGEST)
+        autocovariance = rotated[self._diagonal, self._diagonal]
+        self._precision = _precision(autocovariance, white=self._size > LARGEST)
         self._full = _terms(self._q, self._precision, self._middle, None, xp)
         u = self._full.u
         self._of_full = xp.einsum('ask,absj->kjab', u, xp.einsum('abts,btj->absj', self._between, u))
         self._vibrations = [self._vibration(tone) for tone in tones]
 
     def _vibration(self, tone: Tone) -> _Vibration:
-        xp, turn = self._xp, self._combinations.turn
+        xp, matrix = self._xp, self._combinations.matrix
         angle = np.asarray(2.0 * pi * tone.frequency * (np.arange(self._size) - 0.5 * (self._size - 1)), np.float64)
         waves = np.stack((xp.cos_many(angle), xp.sin_many(angle)))
-        covariance = xp.einsum('ac,cd,bd->ab', turn, tone.covariance, turn)
+        covariance = xp.einsum('ac,cd,bd->ab', matrix, tone.covariance, matrix)
         return _Vibration(covariance, waves, xp.einsum('ask,s->ak', self._full.u, waves[0]))
 
     def _residual_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
@@ -245,8 +247,8 @@ class BlockFit:
         if weights is None:
             residual = 1.0 - xp.einsum('kza,ak->za', x, vibration.full)
             return np.asarray(vibration.covariance * (residual[:, :, None] * residual[:, None, :]))
-        kept = xp.einsum('zas,ws->wza', weights, vibration.waves)
-        residual, sine = 1.0 - kept[0], kept[1]
+        response = xp.einsum('zas,ws->wza', weights, vibration.waves)
+        residual, sine = 1.0 - response[0], response[1]
         both = residual[:, :, None] * residual[:, None, :] + sine[:, :, None] * sine[:, None, :]
         return np.asarray(vibration.covariance * both)
 
@@ -297,14 +299,14 @@ class BlockFit:
             weights = np.zeros((blocks, count, self._size))
             weights[:, :, slots] = xp.einsum('ask,kza->zas', terms.u, x)
             covariance = self._covariance_of(weights)
-        misfit = [False] * blocks
+        poor_fit = [False] * blocks
         if orders > 1:
             free = samples - reported
             # In units of the noise: a chi-square of n - K degrees of freedom.
             squares = xp.sum(z * observed[orders + reported :], 0) - xp.sum(observed[:reported] * c, 0)
-            over = squares > (free + _MISFIT * xp.root(2.0 * free) if free else np.inf)
+            over = squares > (free + _POOR_FIT * xp.root(2.0 * free) if free else np.inf)
             if np.count_nonzero(over):
-                misfit = [any(row) for row in over.tolist()]
+                poor_fit = [any(row) for row in over.tolist()]
                 rest = z - xp.einsum('sk,kza->sza', terms.q[:, :reported], c)
                 missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / free, 0.0)
             covariance[:, self._diagonal, self._diagonal] += missed
@@ -312,15 +314,15 @@ class BlockFit:
         if self._vibrations:
             vibrating = self._vibrate(covariance, x, weights)
         rows, covariance = self._combinations.back(value, covariance)
-        return FittedRun(list(map(tuple, rows.tolist())), covariance, misfit, vibrating, memories)
+        return FittedRun(list(map(tuple, rows.tolist())), covariance, poor_fit, vibrating, memories)
 
     def _vibrate(self, covariance: FloatArray, x: FloatArray, weights: FloatArray | None) -> list[tuple[int, ...]]:
         """Add what vibrates to the ``covariance`` (B, C, C) of blocks; for each the tones that matter there."""
         parts = [self._residual_of(vibration, x, weights) for vibration in self._vibrations]
         for part in parts:
             covariance += part
-        own = MATTERS * covariance[:, self._diagonal, self._diagonal]
-        matters = np.stack([(part[:, self._diagonal, self._diagonal] > own).any(axis=1) for part in parts], axis=1)
+        limit = MATTERS * covariance[:, self._diagonal, self._diagonal]
+        matters = np.stack([(part[:, self._diagonal, self._diagonal] > limit).any(axis=1) for part in parts], axis=1)
         return [tuple(np.flatnonzero(row).tolist()) for row in matters]
 
     def state(self) -> tuple[float, ...]:
@@ -343,8 +345,8 @@ class BlockFit:
         cross = p[:, slots[:, None], gone]
         inner = inverse(p[:, gone[:, None], gone])
         xp = self._xp
-        own = p[:, slots[:, None], slots] - xp.einsum('asg,atg->ast', xp.einsum('asg,agh->ash', cross, inner), cross)
-        return _terms(self._q[slots], own, self._middle, self._full.v, xp)
+        schur = p[:, slots[:, None], slots] - xp.einsum('asg,atg->ast', xp.einsum('asg,agh->ash', cross, inner), cross)
+        return _terms(self._q[slots], schur, self._middle, self._full.v, xp)
 
     def _motion(self, c: FloatArray, terms: _Terms, memory: MotionMemory) -> tuple[Sequence[MotionMemory], FloatArray]:
         """Return the memory after each block, and tau^2 (K, B, C) by it; of order 0 nothing is known beforehand.
@@ -381,14 +383,14 @@ class BlockFit:
         Those of a block with gaps depend on each other: each may be within its noise, and all of them not.
         """
         blocks, reported, count = c.shape
-        own, usual = c[:, 1:], tau[:, 1:reported]
+        higher, usual = c[:, 1:], tau[:, 1:reported]
         expected = terms.together + usual.swapaxes(1, 2)[..., None] * np.eye(reported - 1)
         inverted = inverse(expected.reshape(-1, reported - 1, reported - 1)).reshape(
             blocks, count, reported - 1, reported - 1
         )
-        squares = self._xp.einsum('zja,zajk,zka->za', own, inverted, own)
+        squares = self._xp.einsum('zja,zajk,zka->za', higher, inverted, higher)
         over = squares > reported - 1 + _CONTRADICTED * self._xp.root(2.0 * (reported - 1))
-        np.maximum(usual, own * own + terms.v[1:], out=usual, where=over[:, None])
+        np.maximum(usual, higher * higher + terms.v[1:], out=usual, where=over[:, None])
 
     def _covariance_of(self, weights: FloatArray) -> FloatArray:
         """Covariance (B, C, C) of the weighted sums; ``weights`` (B, C, N)."""
@@ -408,8 +410,8 @@ def _recent_after(recent: FloatArray, excess: FloatArray, sure: FloatArray) -> F
     news[:, 0], news[:, 1] = sure * excess, sure
     for before, after, new in zip(out, out[1:], news, strict=False):
         after[:] = before
-        own = after[:, :reported]
-        own += _FORGET * (new - own)
+        determined = after[:, :reported]
+        determined += _FORGET * (new - determined)
     return out
 
 
@@ -444,16 +446,16 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, xp: Arithmet
     """
     reported, used = len(terms.v), terms.used
     priors = 1.0 / motion[used]
-    found = _solved(terms.rest, priors, terms.right)
+    solution = _solved(terms.rest, priors, terms.right)
     x, missed = np.zeros(motion.shape), np.zeros(motion.shape[1:])
     first: FloatArray = terms.first
     # What the weights miss of an order is its weight times its prior's precision.
-    for w, prior, share in zip(found, priors, terms.share, strict=True):
+    for w, prior, share in zip(solution, priors, terms.share, strict=True):
         missed += w * w * prior
         first = first - share * w
     x[0] = first
-    if found:
-        x[used] = found
+    if solution:
+        x[used] = solution
     if reported < len(motion):
         # So few samples do not determine these orders.
         undetermined = middle[reported:, None, None] - xp.einsum('akj,jza->kza', terms.information[:, reported:], x)
@@ -467,16 +469,16 @@ def _solved(matrix: FloatArray, added: FloatArray, right: FloatArray) -> list[Fl
     """
     rows: list[list[FloatArray]] = []
     x: list[FloatArray] = []
-    for i, (line, more, own) in enumerate(zip(matrix, added, right, strict=True)):
+    for i, (line, more, rhs) in enumerate(zip(matrix, added, right, strict=True)):
         row = list(line)
         row[i] = row[i] + more
         for j, pivot in enumerate(rows):
             factor = row[j] / pivot[j]
             for m in range(j + 1, len(row)):
                 row[m] = row[m] - factor * pivot[m]
-            own = own - factor * x[j]
+            rhs = rhs - factor * x[j]
         rows.append(row)
-        x.append(own)
+        x.append(rhs)
     for i in range(len(x) - 1, -1, -1):
         for m in range(i + 1, len(x)):
             x[i] = x[i] - rows[i][m] * x[m]

@@ -25,12 +25,12 @@ Residual = Callable[[FloatArray], FloatArray]
 
 
 class Combinations(abc.ABC):
-    """``turn`` (C, C): one combination of the C readings a row. ``moving``: how many of them move with the link.
+    """``matrix`` (C, C): one combination of the C readings a row. ``moving``: how many of them move with the link.
 
     ``still``: the first one that does not move to any order.
     """
 
-    turn: FloatArray
+    matrix: FloatArray
     moving: int
     still: int
 
@@ -54,15 +54,15 @@ class _BaseLine(Combinations):
 
     def __init__(self, centers: FloatArray, beams: FloatArray, xp: Arithmetic) -> None:
         self._xp = xp
-        self.turn = combinations(beams, xp)
+        self.matrix = combinations(beams, xp)
         apart = self._apart = centers[0] - centers[1]
-        self._across, self._along = (float(xp.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
+        self._across, self._along = (float(xp.einsum('i,i->', row[:2], apart)) for row in self.matrix[2:4])
         self._beams_apart = float(xp.hypot_many(*(beams[0] - beams[1])))
         self._base_line = self._beams_apart * _HALF
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        z = self._xp.einsum('ac,sc->as', self.turn, dots)
+        z = self._xp.einsum('ac,sc->as', self.matrix, dots)
         # The length itself, not its first order: a twist by 1 degree would move that by 13 um.
         z[3] = self._xp.hypot_many(z[3] + self._along, z[2] + self._across) - self._base_line
         return np.asarray(z)
@@ -74,11 +74,11 @@ class _BaseLine(Combinations):
         length = length + self._base_line
         across = twist + self._across
         along = np.sqrt(np.maximum(length * length - across * across, 1e-4 * length * length))
-        to_x, to_y, to_twist, to_length = self.turn
+        to_x, to_y, to_twist, to_length = self.matrix
         longer = along - self._along
         dots = x * to_x + y * to_y + twist * to_twist + longer * to_length
         back = np.empty(covariance.shape)
-        back[:] = self.turn
+        back[:] = self.matrix
         back[:, 2] -= (across / along) * to_length
         back[:, 3] *= length / along
         return dots, self._xp.einsum('zac,zab,zbd->zcd', back, covariance, back)
@@ -96,23 +96,23 @@ class _Several(Combinations):
         """``slopes`` (C, unknowns): how each reading goes with each unknown at rest."""
         self._xp = xp
         self._residual = residual
-        self.turn = _completed(slopes, xp)
+        self.matrix = _completed(slopes, xp)
         self.moving = slopes.shape[1]
         self.still = len(slopes)
 
     def of(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
-        return self._xp.einsum('ac,sc->as', self.turn, dots)
+        return self._xp.einsum('ac,sc->as', self.matrix, dots)
 
     def back(self, value: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See :class:`Combinations`."""
-        dots = self._xp.einsum('ac,za->zc', self.turn, value)
-        return dots, self._xp.einsum('ac,zab,bd->zcd', self.turn, covariance, self.turn)
+        dots = self._xp.einsum('ac,za->zc', self.matrix, value)
+        return dots, self._xp.einsum('ac,zab,bd->zcd', self.matrix, covariance, self.matrix)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
         residual = dots if self._residual is None else self._residual(dots)
-        return self._xp.einsum('c,sc->s', self.turn[self.moving], residual)
+        return self._xp.einsum('c,sc->s', self.matrix[self.moving], residual)
 
 
 def combinations_of(

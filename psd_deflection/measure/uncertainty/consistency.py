@@ -166,7 +166,7 @@ class UnexplainedResidual(Unexplained):
         q, pull = self._q, self._pull(value).tolist()
         if self._freedom < 3:
             least = _UNSEEN * float(q.max())
-            return [p / own if own > least else 0.0 for own, p in zip(self.information, pull, strict=True)]
+            return [p / info if info > least else 0.0 for info, p in zip(self.information, pull, strict=True)]
         errors: list[float] = []
         for at in range(0, len(pull), 2):
             (a, b), (_, d) = q[at : at + 2, at : at + 2].tolist()
@@ -196,40 +196,42 @@ class ConsistencyCheck:
         self._excluded, self._blocks_left = 0, 0
         self._held, self._mean, self._lasting = [0.0] * size, [0.0] * size, [0.0] * size
 
-    def agrees(self, found: Unexplained | None, factor: float) -> bool:
+    def agrees(self, unexplained: Unexplained | None, factor: float) -> bool:
         """Whether the readings are consistent, and there are enough of them to tell; ``factor`` on the limits."""
-        return found is not None and found.chi_square <= factor * self.limit
+        return unexplained is not None and unexplained.chi_square <= factor * self.limit
 
-    def candidates(self, found: Unexplained | None, factor: float) -> tuple[int, ...]:
+    def candidates(self, unexplained: Unexplained | None, factor: float) -> tuple[int, ...]:
         """Return the PSDs (from 1) of which :meth:`update` needs to know whether the others are consistent."""
-        if found is None:
+        if unexplained is None:
             return ()
-        if found.chi_square > factor * self.limit:
+        if unexplained.chi_square > factor * self.limit:
             return tuple(range(1, self._psds + 1))
         return (self._excluded,) if self._excluded and self._blocks_left > 1 else ()
 
-    def update(self, found: Unexplained | None, factor: float, blamed: Collection[int] | None) -> ConsistencyResult:
+    def update(
+        self, unexplained: Unexplained | None, factor: float, blamed: Collection[int] | None
+    ) -> ConsistencyResult:
         """Check one block; ``factor`` on the limits.
 
         ``blamed``: those of the :meth:`candidates` without which the readings are consistent; None: no PSD may be
         excluded. Of all readings together a wrong one is mixed into the others, so they need fits of their own.
         """
-        if found is None:
+        if unexplained is None:
             none = (0.0,) * (2 * self._psds)
             return ConsistencyResult(0.0, False, none, none, 0, self.freedom)
-        contradict = found.chi_square > factor * self.limit
+        contradict = unexplained.chi_square > factor * self.limit
         self._exclude(contradict, blamed)
-        errors = found.errors_of(found.value)
-        self._update_lasting(found, factor)
+        errors = unexplained.errors_of(unexplained.value)
+        self._update_lasting(unexplained, factor)
         hold = contradict and not self._excluded
-        doubtful = hold or found.chi_square > factor * self._doubtful
+        doubtful = hold or unexplained.chi_square > factor * self._doubtful
         squares = [e * e if doubtful else 0.0 for e in errors]
         if contradict and blamed:
             squares = [square * (1 + i // 2 in blamed) for i, square in enumerate(squares)]
-        self._hold(found, squares if hold else [0.0] * len(squares), factor)
+        self._hold(unexplained, squares if hold else [0.0] * len(squares), factor)
         contradict = contradict or self._excluded > 0 or any(self._held)
         possible = self._possible(squares)
-        result = found.chi_square, contradict, found.of_readings(errors), found.of_readings(possible)
+        result = unexplained.chi_square, contradict, unexplained.of_readings(errors), unexplained.of_readings(possible)
         return ConsistencyResult(*result, self._excluded, self.freedom)
 
     def _possible(self, squares: list[float]) -> list[float]:
@@ -253,18 +255,18 @@ class ConsistencyCheck:
             if self._blocks_left <= 0 or self._excluded not in blamed:
                 self._excluded = 0
 
-    def _update_lasting(self, found: Unexplained, factor: float) -> None:
+    def _update_lasting(self, unexplained: Unexplained, factor: float) -> None:
         """Update the mean of the last blocks, and hold the errors of a residual that lasts."""
-        self._mean = [mean + SLOWLY * (r - mean) for mean, r in zip(self._mean, found.value, strict=True)]
-        lasts = found.chi_square_of(self._mean) > factor * LASTING
-        squares = [e * e for e in found.errors_of(self._mean)] if lasts else [0.0] * len(self._mean)
+        self._mean = [mean + SLOWLY * (r - mean) for mean, r in zip(self._mean, unexplained.value, strict=True)]
+        lasts = unexplained.chi_square_of(self._mean) > factor * LASTING
+        squares = [e * e for e in unexplained.errors_of(self._mean)] if lasts else [0.0] * len(self._mean)
         faded = [max(_FADE * old, new) for old, new in zip(self._lasting, squares, strict=True)]
-        self._lasting = faded if _exceeds(faded, found, 1.0) else [0.0] * len(faded)
+        self._lasting = faded if _exceeds(faded, unexplained, 1.0) else [0.0] * len(faded)
 
-    def _hold(self, found: Unexplained, squares: list[float], factor: float) -> None:
+    def _hold(self, unexplained: Unexplained, squares: list[float], factor: float) -> None:
         faded = [max(_FADE * old, new) for old, new in zip(self._held, squares, strict=True)]
-        kept = not self._excluded and _exceeds(faded, found, factor * self.limit)
-        self._held = faded if kept else [0.0] * len(faded)
+        exceeds = not self._excluded and _exceeds(faded, unexplained, factor * self.limit)
+        self._held = faded if exceeds else [0.0] * len(faded)
 
     def state(self) -> tuple[float, ...]:
         """Return the state as numbers."""
@@ -280,9 +282,9 @@ class ConsistencyCheck:
         self._held, self._mean, self._lasting = numbers[:size], numbers[size : 2 * size], numbers[2 * size :]
 
 
-def _exceeds(squares: list[float], found: Unexplained, limit: float) -> bool:
+def _exceeds(squares: list[float], unexplained: Unexplained, limit: float) -> bool:
     """Whether the chi-square of one of the squared errors is above ``limit``."""
-    return any(square * i > limit for square, i in zip(squares, found.information, strict=True))
+    return any(square * i > limit for square, i in zip(squares, unexplained.information, strict=True))
 
 
 def _limits(freedom: int) -> tuple[float, float]:

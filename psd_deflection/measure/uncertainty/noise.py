@@ -146,7 +146,7 @@ class StreamNoise:
     ) -> None:
         """Use these places, m, from now on."""
         self._combinations = combinations_of(centers, beams, slopes, residual, self._xp)
-        self._moving = self._combinations.turn[: self._combinations.moving]
+        self._moving = self._combinations.matrix[: self._combinations.moving]
 
     @property
     def measured(self) -> bool:
@@ -305,9 +305,9 @@ class StreamNoise:
         """Look for tones of a segment; return its ``dots`` (n, C), m, without those of the electronics."""
         still = np.column_stack((self._combinations.fixed(dots), sums))
         known = [*(tone.frequency for tone in self.tones), *(hum.frequency for hum in self.hum)]
-        found = search.tones(places, dots, still, self._moving, known)
-        self.tones, self.hum = found.moving, ()
-        for frequency in found.hum:
+        tones = search.tones(places, dots, still, self._moving, known)
+        self.tones, self.hum = tones.moving, ()
+        for frequency in tones.hum:
             dots, hum = search.without(places, dots, frequency)
             self.hum += (hum,)
         return dots
@@ -407,17 +407,17 @@ def _autocovariance(
     centred = series - xp.sum(series, 0) / len(series)
     centred -= at[:, None] * (xp.einsum('t,tc->c', at, centred) / float(xp.sum(at * at, 0)))
     count = series.shape[1]
-    far = _FAR * lags
+    max_lag = _FAR * lags
     padded = np.zeros((length, count + 1))
     padded[places, :count] = centred
     padded[places, count] = 1.0
-    products = lagged_products(padded, far)
+    products = lagged_products(padded, max_lag)
     present = products[count, count]
     # Where two samples are never that far apart, nothing is known: taken as independent.
     each = np.where(present > 0.5, products[:count, :count] / np.maximum(present, 1.0), 0.0)
     # Mean and slope were taken off: 2 of length / far degrees of freedom of what is slower than that.
-    slow = xp.einsum('cdl,l->cd', each, _mean_weights(far))
-    taken = (slow + slow.T)[:, :, None] / (length / far - 2)
+    slow = xp.einsum('cdl,l->cd', each, _mean_weights(max_lag))
+    taken = (slow + slow.T)[:, :, None] / (length / max_lag - 2)
     # Products with 0 for what is absent are those of a covariance whatever the samples are, and stay so over one
     # divisor: that of the lag at which gaps cost most, so that none is too small.
     present = present[:lags]
@@ -431,10 +431,10 @@ def _covariance(each: FloatArray, sure: FloatArray, xp: Arithmetic = FIXED) -> F
     ``sure`` (N,): times it, it is one. As little of that is taken as makes it one.
     """
     count, _, size = each.shape
-    own = _OWN_SHARE * float(each[range(count), range(count), 0].max()) + _LEAST
+    ridge = _OWN_SHARE * float(each[range(count), range(count), 0].max()) + _LEAST
     for share in _SHARES if size <= LARGEST else (1.0,):
         mixed = each * (1.0 + share * (sure - 1.0))
-        mixed[range(count), range(count), 0] += own
+        mixed[range(count), range(count), 0] += ridge
         if share == 1.0 or _positive(mixed, xp):
             break
     return mixed

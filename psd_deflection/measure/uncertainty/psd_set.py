@@ -97,8 +97,8 @@ class PsdSet:
 
     def set_noise(self, noise: StreamNoise) -> None:
         """Use their part of the noise of all readings."""
-        own = np.ix_(self.columns, self.columns)
-        self.fit.set_noise(noise.gamma[own], [Tone(t.frequency, t.covariance[own]) for t in noise.tones])
+        indices = np.ix_(self.columns, self.columns)
+        self.fit.set_noise(noise.gamma[indices], [Tone(t.frequency, t.covariance[indices]) for t in noise.tones])
 
     def unexplained(
         self, dots: tuple[float, ...], residual: tuple[float, ...], covariance: FloatArray, pose: Sequence[float]

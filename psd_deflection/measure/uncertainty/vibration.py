@@ -112,27 +112,32 @@ class ToneSearch:
         middle = start + _GROUP * (np.arange(self._groups) + 0.5)
         bins = np.arange(self._length // 2 + 1)
         self._start = start
-        self._left = np.clip((bins - middle[0]) // _GROUP, 0, max(self._groups - 2, 0)).astype(np.int64)
-        self._right = np.minimum(self._left + 1, self._groups - 1)
-        self._share = np.clip((bins - middle[self._left]) / _GROUP, 0.0, 1.0)[:, None]
+        self._lower = np.clip((bins - middle[0]) // _GROUP, 0, max(self._groups - 2, 0)).astype(np.int64)
+        self._upper = np.minimum(self._lower + 1, self._groups - 1)
+        self._share = np.clip((bins - middle[self._lower]) / _GROUP, 0.0, 1.0)[:, None]
 
     def tones(
-        self, places: IntArray, dots: FloatArray, still: FloatArray, turn: FloatArray, known: Sequence[float] = ()
+        self,
+        places: IntArray,
+        dots: FloatArray,
+        still: FloatArray,
+        combinations: FloatArray,
+        known: Sequence[float] = (),
     ) -> Tones:
         """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
-        ``dots`` (n, C), m: the readings, ``turn`` (a, C): rows of their combinations that move with the link.
+        ``dots`` (n, C), m: the readings, ``combinations`` (a, C): rows of their combinations that move with the link.
         ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may
         be weaker.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
             return Tones()
-        count, readings = turn.shape
+        count, readings = combinations.shape
         series = _filled(places, np.column_stack((dots, still)), self._length)
         every = transform(series * self._window[:, None])
         moving = np.empty((len(every), count), np.complex128)
-        moving.real = self._xp.einsum('fc,ac->fa', every.real[:, :readings], turn)
-        moving.imag = self._xp.einsum('fc,ac->fa', every.imag[:, :readings], turn)
+        moving.real = self._xp.einsum('fc,ac->fa', every.real[:, :readings], combinations)
+        moving.imag = self._xp.einsum('fc,ac->fa', every.imag[:, :readings], combinations)
         spectrum = np.column_stack((moving, every[:, readings:]))
         power = self._xp.power_spectrum(spectrum)
         above = power / self._floor(power)
@@ -159,13 +164,13 @@ class ToneSearch:
             mean = self._xp.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
             frequency = float(mean) / float(self._xp.sum(weight, 0)) / self._length
             # Hum is narrow; and of fewer bins less by chance.
-            near = slice(max(peak - _NARROW, self._first), min(peak + _NARROW, self._last) + 1)
-            shown = above[near, count:].max(axis=0) >= _OBSERVED
-            if bool((shown & (self._xp.sum(power[near, count:], 0) > _ELECTRIC * moved.max())).any()):
+            narrow = slice(max(peak - _NARROW, self._first), min(peak + _NARROW, self._last) + 1)
+            shown = above[narrow, count:].max(axis=0) >= _OBSERVED
+            if bool((shown & (self._xp.sum(power[narrow, count:], 0) > _ELECTRIC * moved.max())).any()):
                 hum.append(frequency)
                 continue
             covariance = scale * self._cross_spectrum(spectrum[None, band, :count] * observed[:count])[0]
-            out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, covariance, turn)))
+            out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', combinations, covariance, combinations)))
         # What the tones have is theirs already.
         for band in self._broad(every * free[:, None], readings, known):
             # The quietest group has the noise alone, or hardly more.
@@ -173,7 +178,7 @@ class ToneSearch:
             covariance = self._cross_spectrum(spectrum[None, band, :count] * free[band, None])[0]
             covariance[range(count), range(count)] -= np.count_nonzero(free[band]) * noise
             frequency = 0.5 * (band.start + band.stop - 1) / self._length
-            out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', turn, scale * covariance, turn)))
+            out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', combinations, scale * covariance, combinations)))
         return Tones(tuple(out), tuple(hum))
 
     def _grouped(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -192,17 +197,17 @@ class ToneSearch:
         slower motion.
         """
         cross = self._cross_spectrum(self._grouped(every))
-        own = np.sqrt(np.diagonal(cross, axis1=1, axis2=2)) + _LEAST
-        alike = np.abs(cross) / (own[:, :, None] * own[:, None, :])
-        level, psd = self._xp.sum(np.square(own[:, :readings]), 1), np.arange(readings) // 2
+        amplitudes = np.sqrt(np.diagonal(cross, axis1=1, axis2=2)) + _LEAST
+        alike = np.abs(cross) / (amplitudes[:, :, None] * amplitudes[:, None, :])
+        level, psd = self._xp.sum(np.square(amplitudes[:, :readings]), 1), np.arange(readings) // 2
         coherent = alike[:, :readings, :readings][:, psd[:, None] != psd].max(axis=1)
         still = alike[:, readings:, readings:]
         electric = (still - np.eye(still.shape[1])).max(axis=(1, 2)) > _STILL_COHERENT
         starts = self._start + _GROUP * np.arange(self._groups)
         held = np.isin(np.arange(self._groups), [(round(f * self._length) - self._start) // _GROUP for f in known])
-        found = (coherent > np.where(held, _STILL_COHERENT, _COHERENT)) & ~electric & (starts >= self._followed)
-        for run in np.split(np.arange(self._groups), np.flatnonzero(np.diff(found)) + 1):
-            if found[run[0]] and level[run].max() > level[run[0] - 1]:
+        vibrates = (coherent > np.where(held, _STILL_COHERENT, _COHERENT)) & ~electric & (starts >= self._followed)
+        for run in np.split(np.arange(self._groups), np.flatnonzero(np.diff(vibrates)) + 1):
+            if vibrates[run[0]] and level[run].max() > level[run[0] - 1]:
                 yield slice(int(starts[run[0]]), int(starts[run[-1]]) + _GROUP)
 
     def without(self, places: IntArray, dots: FloatArray, frequency: float) -> tuple[FloatArray, Hum]:
@@ -221,8 +226,8 @@ class ToneSearch:
         grouped = self._grouped(power)
         # The median of an exponential distribution is ln 2 of its mean.
         medians = np.median(grouped, axis=1) / _LN_2
-        left = medians[self._left]
-        return np.asarray(left + self._share * (medians[self._right] - left) + _LEAST)
+        lower = medians[self._lower]
+        return np.asarray(lower + self._share * (medians[self._upper] - lower) + _LEAST)
 
 
 _LN_2 = 0.6931471805599453
@@ -274,9 +279,9 @@ def why_moving(dots: FloatArray, noise: tuple[float, ...]) -> str:
     half = len(dots) // 2
     drift = np.abs(dots[half:].mean(axis=0) - dots[:half].mean(axis=0))
     least = MOVING * np.sqrt(noise)
-    beyond = np.maximum(scatter / np.maximum(least, RINGS), drift / np.maximum(least, STILL))
-    worst = int(np.argmax(beyond))
-    if beyond[worst] <= 1.0:
+    ratios = np.maximum(scatter / np.maximum(least, RINGS), drift / np.maximum(least, STILL))
+    worst = int(np.argmax(ratios))
+    if ratios[worst] <= 1.0:
         return ''
     return (
         f'the link moves: {dot_names(len(noise) // 2)[worst]} varied by {scatter[worst] * 1e6:.1f} µm rms in the last '

@@ -248,8 +248,8 @@ class _BesideSamples:
         # The unfinished block belongs to the time before the change.
         yield list(self._pipeline.flush())
         self._pipeline.apply(change)
-        for misfit in self._pipeline.misfits:
-            self._recording.warn(f'block {change.block}: {misfit}')
+        for mismatch in self._pipeline.mismatches:
+            self._recording.warn(f'block {change.block}: {mismatch}')
         yield [change]
 
 

@@ -183,8 +183,8 @@ def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> No
         miss = y[here] - gains.observed[0] @ x
         posterior = np.linalg.inv(np.linalg.inv(p) + gains.information[0, k])
         score = gains.pulled[0, k] @ miss
-        found = gains.kept[0, k] @ (x + posterior @ score) + gains.smoothed[0, k] @ (miss + gains.observed[0] @ x)
-        covariance = gains.kept[0, k] @ posterior @ gains.kept[0, k].T + gains.residual[0, k]
+        found = gains.transition[0, k] @ (x + posterior @ score) + gains.smoothed[0, k] @ (miss + gains.observed[0] @ x)
+        covariance = gains.transition[0, k] @ posterior @ gains.transition[0, k].T + gains.residual[0, k]
         squares = miss @ gains.precision[0, k] @ miss - score @ posterior @ score
         size = gains.log_size[0, k] + np.linalg.slogdet(p)[1] - np.linalg.slogdet(posterior)[1]
         np.testing.assert_allclose(found, expected[0], rtol=1e-7, atol=1e-12)

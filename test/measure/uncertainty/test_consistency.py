@@ -229,17 +229,17 @@ def test_the_first_ones_move_with_the_link_and_the_others_do_not(psds: int, unkn
     centers = FOUR_CENTERS[:psds]
     of = combinations_of(centers, centers + ZEROS[:psds], slopes)
     assert (of.moving, of.still) == (unknowns, count)
-    np.testing.assert_allclose(of.turn @ of.turn.T, np.eye(count), atol=1e-14)
-    np.testing.assert_allclose(of.turn[unknowns:] @ slopes, 0.0, atol=1e-13)
+    np.testing.assert_allclose(of.matrix @ of.matrix.T, np.eye(count), atol=1e-14)
+    np.testing.assert_allclose(of.matrix[unknowns:] @ slopes, 0.0, atol=1e-13)
     dots = 1e-3 * OTHER_RNG.normal(size=(7, count))
-    np.testing.assert_allclose(of.of(dots), (dots @ of.turn.T).T, rtol=1e-12)
-    np.testing.assert_allclose(of.fixed(dots), dots @ of.turn[unknowns], rtol=1e-12)
+    np.testing.assert_allclose(of.of(dots), (dots @ of.matrix.T).T, rtol=1e-12)
+    np.testing.assert_allclose(of.fixed(dots), dots @ of.matrix[unknowns], rtol=1e-12)
     mixed = OTHER_RNG.normal(size=(count, count))
     covariance = mixed @ mixed.T
     for row, z in zip(dots, of.of(dots).T, strict=True):
         back, back_covariance = of.back(z[None], covariance[None])
         np.testing.assert_allclose(back[0], row, atol=1e-17)
-        np.testing.assert_allclose(back_covariance[0], of.turn.T @ covariance @ of.turn, rtol=1e-12)
+        np.testing.assert_allclose(back_covariance[0], of.matrix.T @ covariance @ of.matrix, rtol=1e-12)
     # What does not move is of what the model leaves, if it is asked.
     half = combinations_of(centers, centers, slopes, lambda d: np.asarray(0.5 * d))
     np.testing.assert_allclose(half.fixed(dots), 0.5 * of.fixed(dots), rtol=1e-12)
@@ -252,7 +252,7 @@ def test_a_flat_plate_is_meant_unless_slopes_are_given() -> None:
     of = combinations_of(centers, beams)
     slopes = np.array([row for x, y in beams for row in ([-1.0, 0.0, y], [0.0, -1.0, -x])])
     assert of.moving == 3
-    np.testing.assert_allclose(of.turn[3:] @ slopes, 0.0, atol=1e-15)
+    np.testing.assert_allclose(of.matrix[3:] @ slopes, 0.0, atol=1e-15)
 
 
 def test_near_dependent_slopes_leave_no_rounding() -> None:
@@ -262,11 +262,11 @@ def test_near_dependent_slopes_leave_no_rounding() -> None:
         slopes[[0, 2, 4], [0, 1, 2]] = 1.0
         slopes[1, 0] = off
         of = combinations_of(FOUR_CENTERS[:3], FOUR_CENTERS[:3], slopes)
-        np.testing.assert_allclose(of.turn @ of.turn.T, np.eye(6), atol=1e-14)
+        np.testing.assert_allclose(of.matrix @ of.matrix.T, np.eye(6), atol=1e-14)
         # The first that is not of the slopes: of x1 what is left of it, or y1.
-        assert abs(of.turn[3, 1]) == pytest.approx(1.0, abs=1e-9)
-        np.testing.assert_allclose(of.turn[3:] @ slopes, 0.0, atol=1e-12)
-        assert (of.turn[3, 1] > 0.0) == spanned
+        assert abs(of.matrix[3, 1]) == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(of.matrix[3:] @ slopes, 0.0, atol=1e-12)
+        assert (of.matrix[3, 1] > 0.0) == spanned
 
 
 def base_line_back(value: list[float], covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

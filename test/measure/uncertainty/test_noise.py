@@ -455,7 +455,7 @@ class Dense:
 
     def __init__(self, gamma: FloatArray, beams: FloatArray) -> None:
         self.of = combinations_of(PLACES, beams)
-        rotated = np.einsum('ac,cdl,bd->abl', self.of.turn, gamma, self.of.turn)
+        rotated = np.einsum('ac,cdl,bd->abl', self.of.matrix, gamma, self.of.matrix)
         size = gamma.shape[2]
         later = np.subtract.outer(np.arange(size), np.arange(size)).T
         back = rotated.transpose(1, 0, 2)
@@ -563,7 +563,7 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
         got = fit.fit(slots, dots[slots])
         want, covariance, misfit = dense.fit(slots, dots[slots])
         sd = np.sqrt(np.diag(covariance))
-        assert got.misfit == misfit, block
+        assert got.poor_fit == misfit, block
         np.testing.assert_allclose((np.array(got.dots) - want) / sd, 0.0, atol=1e-6, err_msg=str(block))
         np.testing.assert_allclose((got.covariance - covariance) / np.outer(sd, sd), 0.0, atol=1e-6, err_msg=str(block))
         misfits += misfit
