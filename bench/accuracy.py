@@ -43,9 +43,9 @@ def errors(rig: Rig, load: tuple[float, float, float], blocks: int) -> tuple[Flo
     pipeline = Pipeline(rig)
     chunk = RawChunk(seq, t_ns, counts, np.zeros(len(seq), np.uint8), rig.converter.volts_per_count)
     records = [*pipeline.process(chunk), *pipeline.flush()]
-    found = np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])
+    estimates = np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])
     truth = pose.reshape(-1, size, 3).mean(axis=1)
-    return found - truth[: len(found)], truth.mean(axis=0)
+    return estimates - truth[: len(estimates)], truth.mean(axis=0)
 
 
 def main() -> int:

@@ -77,8 +77,8 @@ def record(folder: Path) -> None:
         recording, rig = open_for_replay(str(BAGS / name), None, None)
         sink = open_sink(str(folder / name), rig.flat(), device_hello=recording.hello)
         for records in replayed(recording, Pipeline(rig), None):
-            for one in records:
-                sink.put(one)
+            for output in records:
+                sink.put(output)
         sink.close()
 
 
@@ -124,7 +124,7 @@ def table(jobs: int, folder: Path) -> bool:
         # What is the same message by message is replayed once for all.
         first = {estimates_of(place): str(place) for place in reversed(places.values())}
         kinds = {name: estimates_of(place) for name, place in places.items()}
-        answers = pool.map(lambda one: of_setting(one, '--compare', *first.values()), every.values())
+        answers = pool.map(lambda setting: of_setting(setting, '--compare', *first.values()), every.values())
         differing = [
             dict(zip(first, (tuple(map(int, line.split())) for line in answer.splitlines()), strict=True))
             for answer in answers
@@ -133,7 +133,7 @@ def table(jobs: int, folder: Path) -> bool:
     print('messages that differ; recorded under: one row each, replayed under: one column each, in the same order')
     total = 0
     for name in every:
-        counts = [found[kinds[name]][0] for found in differing]
+        counts = [row[kinds[name]][0] for row in differing]
         total += sum(counts)
         print(f'{name:<{wide}}  ' + ' '.join(f'{count:>5}' for count in counts))
     equal = differing[0][kinds[next(iter(every))]][1]

@@ -126,8 +126,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f'{name:34}{before * 1e3:10.4f} mm{after * 1e3:10.4f} mm{100.0 * after / before:8.2f} %')
     compensated = chart(without, ran)
     print(f'vibration after a quick move without a shaper: {1e3 * shapers.unshaped():.2f} mm')
-    left = shapers.rows()
-    print(*('  '.join(f'{cell:>12}' for cell in row) for row in (shapers.SHAPER_HEAD, *left)), sep='\n')
+    residuals = shapers.rows()
+    print(*('  '.join(f'{cell:>12}' for cell in row) for row in (shapers.SHAPER_HEAD, *residuals)), sep='\n')
     head = ('rms distance from the rigid pose', 'without, mm', 'with, mm', 'left')
     body = [
         '<h1>A payload on a flexible arm, with and without compensation</h1>',
@@ -137,7 +137,7 @@ def main(argv: list[str] | None = None) -> int:
         drawn(compensated),
         '<h1>A quick move, with and without a shaper</h1>',
         '<p>What each shaper leaves of the vibration of the arm. The frequency is right, or 5 % wrong.</p>',
-        table(shapers.SHAPER_HEAD, left),
+        table(shapers.SHAPER_HEAD, residuals),
     ]
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / 'report.html').write_text(page('Compensation', body), encoding='utf-8')

@@ -150,8 +150,8 @@ def parts(reported: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float
         shown = REST if spent else 'all of it'
         for part, ns in {**spent, shown: used - sum(spent.values())}.items():
             out[name, part] += ns / 1e9
-    found = {key: s for key, s in out.items() if s > 0.0}
-    return found, reported['took'], calls * reported['cost'] / 1e9 / sum(found.values())
+    positive = {key: s for key, s in out.items() if s > 0.0}
+    return positive, reported['took'], calls * reported['cost'] / 1e9 / sum(positive.values())
 
 
 def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]:
@@ -191,8 +191,8 @@ def row_of(spent: dict[tuple[str, str], float], took: float, clocks: float) -> R
     share = f'{100.0 * total / took:.1f} % of a core, clocks {100.0 * clocks:.0f} % of it'
     row = Row(f'CPU of the node by part: {share}', '%')
     for thread in sorted(threads, key=threads.__getitem__, reverse=True):
-        for (one, part), s in sorted(spent.items(), key=lambda item: -item[1]):
-            if one == thread and s >= 0.001 * total:
+        for (name, part), s in sorted(spent.items(), key=lambda item: -item[1]):
+            if name == thread and s >= 0.001 * total:
                 row.figures.append(figure(f'{thread}: {part}', 'ours', [100.0 * s / total]))
     return row
 

@@ -67,7 +67,7 @@ def frames(times: int) -> list[Row]:
         return sum(len(decoder.feed(piece)) for piece in received)
 
     def peer(received: list[bytes]) -> int:
-        rest, found = b'', 0
+        rest, count = b'', 0
         for piece in received:
             *full, rest = (rest + piece).split(b'\0')
             decoded = []
@@ -75,8 +75,8 @@ def frames(times: int) -> list[Row]:
                 payload = cobs.decode(frame)
                 if zlib.crc32(payload[:-4]) == crc.unpack(payload[-4:])[0]:
                     decoded.append(layout.unpack(payload[:-4]))
-            found += len(decoded)
-        return found
+            count += len(decoded)
+        return count
 
     def limit(received: list[bytes]) -> None:
         for piece in received:
@@ -117,8 +117,8 @@ def replay(times: int, minutes: float) -> list[Row]:
         def by_mcap_ros2() -> None:
             pipeline = Pipeline(rig)
             with file.open('rb') as stream:
-                found = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
-                for _, _, _, message in found:
+                messages = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
+                for _, _, _, message in messages:
                     _process(pipeline, message)
 
         def limit() -> None:
@@ -221,8 +221,8 @@ def conversion(times: int, minutes: float) -> list[Row]:
         def mcap_to_pandas() -> None:
             parts = []
             with bag.open('rb') as stream:
-                found = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
-                for _, _, _, message in found:
+                messages = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
+                for _, _, _, message in messages:
                     parts.append(_points(message))
             points = np.concatenate(parts)
             frame = pandas.DataFrame({c: points[c] for c in CHANNELS})
@@ -340,16 +340,16 @@ def searched(
     def ours() -> None:
         inside.append(0.0)
         with unittest.mock.patch.object(ForwardModel, 'expect', timed):
-            found = discover([observation], known, without=without)
-        right = found.verdict == 'unknown_effect'
+            discovery = discover([observation], known, without=without)
+        right = discovery.verdict == 'unknown_effect'
         if not without:
             # What explains the recording as well counts as found.
-            sets = [{e.active.effect.name, *e.equivalent} for e in found.effects]
+            sets = [{e.active.effect.name, *e.equivalent} for e in discovery.effects]
             names = [words.partition(',')[0] for words in effects]
             right = len(sets) == len(names) and all(any(n in s for s in sets) for n in names)
         if not right:
-            raise SystemExit(f'{what}: discover found {found!r}')
-        counts.append(found.simulations)
+            raise SystemExit(f'{what}: discover found {discovery!r}')
+        counts.append(discovery.simulations)
 
     row = in_turns(f'discover, {seconds:g} s of a recording, {what}', 's', 1.0, times, ('discover', 'ours', ours, None))
     row.figures.append(figure(f'in its {counts[0]} forward simulations', 'limit', inside, bound))

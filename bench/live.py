@@ -106,14 +106,14 @@ def looker(url: str) -> None:
     print(asyncio.run(look()))
 
 
-def notify_share(seconds: float, turn: Callable[[], object]) -> None:
-    """Prints the share of a core that this process takes, in percent, if it does ``turn`` once a block."""
+def notify_share(seconds: float, step: Callable[[], object]) -> None:
+    """Prints the share of a core that this process takes, in percent, if it does ``step`` once a block."""
     end, before = time.monotonic() + seconds, time.process_time()
-    due = time.monotonic()
-    while due < end:
-        turn()
-        due += 1.0 / BLOCKS_PER_S
-        time.sleep(max(due - time.monotonic(), 0.0))
+    next_time = time.monotonic()
+    while next_time < end:
+        step()
+        next_time += 1.0 / BLOCKS_PER_S
+        time.sleep(max(next_time - time.monotonic(), 0.0))
     print(100.0 * (time.process_time() - before) / seconds)
 
 
@@ -146,12 +146,12 @@ def bare_publishers(recording: str, seconds: float) -> None:
     blocks = blocks_of(recording)
     publishers = {topic: node.create_publisher(message_class(kind), topic, 10) for topic, kind, _ in next(blocks)}
 
-    def turn() -> None:
+    def step() -> None:
         for topic, _, data in next(blocks):
             if topic in publishers:
                 publishers[topic].publish(data)
 
-    notify_share(seconds, turn)
+    notify_share(seconds, step)
 
 
 def bare_writer(recording: str, seconds: float) -> None:
@@ -164,7 +164,7 @@ def bare_writer(recording: str, seconds: float) -> None:
         writer.start()
         channels: dict[str, int] = {}
 
-        def turn() -> None:
+        def step() -> None:
             now = time.time_ns()
             for topic, kind, data in next(blocks):
                 if topic not in channels:
@@ -173,7 +173,7 @@ def bare_writer(recording: str, seconds: float) -> None:
                     )
                 writer.add_message(channels[topic], now, data, now)
 
-        notify_share(seconds, turn)
+        notify_share(seconds, step)
 
 
 def parts(seconds: float, times: int) -> list[float]:
@@ -270,9 +270,9 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
         threading.Thread(target=node.stderr.read, daemon=True).start()
         children = [child('subscriber'), child('bare'), *([child('looker', url)] if page else [])]
         subscriber, bare = children[:2]
-        for one in children:
-            assert one.stdout is not None
-            one.stdout.readline()
+        for process in children:
+            assert process.stdout is not None
+            process.stdout.readline()
         time.sleep(settle)
         used, began = cpu_seconds(node.pid), time.monotonic()
         time.sleep(seconds)
@@ -361,9 +361,9 @@ def start(times: int) -> Row:
         node.wait(60.0)
         device.stop.set()
         device.thread.join()
-        for topic, found in seconds.items():
+        for topic, durations in seconds.items():
             first = min(t for name, _, t in json.loads(heard) if name == topic)
-            found.append((first - began[topic]) / 1e9)
+            durations.append((first - began[topic]) / 1e9)
     return Row(
         'start: command to first published estimate',
         's',
@@ -376,7 +376,7 @@ def start(times: int) -> Row:
 
 def live_rows(alone: Latencies, with_page: Latencies, bare_parts: list[float]) -> list[Row]:
     rows = []
-    for what, found, bounds, most in (
+    for what, latencies, bounds, most in (
         ('', alone, (1.4, 1.2), 1.25),
         (', live page looked at', with_page, (None, None), 1.5),
     ):
@@ -384,12 +384,12 @@ def live_rows(alone: Latencies, with_page: Latencies, bare_parts: list[float]) -
             # In parts of the run, so that there is a spread.
             ours, bare = (
                 [float(np.percentile(part, percent)) for part in np.array_split(values, parts)]
-                for values in (found.ours, found.bare)
+                for values in (latencies.ours, latencies.bare)
             )
             work = f'live{what}: last byte of a block to callback in another process, {word}'
             limit = figure('bare rclpy publish to callback', 'limit', bare, bound)
             rows.append(Row(work, 'ms', [figure('psd_deflection', 'ours', ours), limit]))
-        shares = figure('node', 'ours', [100 * share for share in found.shares])
+        shares = figure('node', 'ours', [100 * share for share in latencies.shares])
         limit = figure('reading the port, publishing, writing, each bare and alone', 'limit', bare_parts, most)
         rows.append(Row(f'live{what}: CPU of the node, recording', '% of a core', [shares, limit]))
     return rows

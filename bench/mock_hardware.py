@@ -191,9 +191,9 @@ def main() -> int:
         shaped(arm, programs)
         compensated(arm, programs)
     finally:
-        for one in reversed(programs):
-            one.end()
-            print(*one.lines[-20:], sep='\n')
+        for program in reversed(programs):
+            program.end()
+            print(*program.lines[-20:], sep='\n')
         arm.close()
     return 0
 

@@ -76,11 +76,11 @@ def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cp
 
 def readme(text: str, rows: Sequence[Row]) -> str:
     """``text`` of README with its rows of figures made of ``rows``."""
-    by = {row.work: row for row in rows}
+    by_work = {row.work: row for row in rows}
     live = 'live: last byte of a block to callback in another process'
-    median, late = by[f'{live}, median'], by[f'{live}, 99th percentile']
-    cpu, looked_at = (by[f'live{page}: CPU of the node, recording'] for page in ('', ', live page looked at'))
-    replay = by['replay of 10 minutes to estimates, all solvers']
+    median, late = by_work[f'{live}, median'], by_work[f'{live}, 99th percentile']
+    cpu, looked_at = (by_work[f'live{page}: CPU of the node, recording'] for page in ('', ', live page looked at'))
+    replay = by_work['replay of 10 minutes to estimates, all solvers']
     bare = next(f for f in replay.figures if f.kind == 'limit')
     ratios = [row.ratio(row.figures[1]) for row in (median, late)]
     made = (

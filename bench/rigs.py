@@ -72,14 +72,14 @@ def sessions(ports: list[str], seconds: float) -> None:
         session.start()
     time.sleep(SETTLE_S)
 
-    def counted() -> tuple[int, int]:
+    def totals() -> tuple[int, int]:
         counters = [session.acquisition.counters for session in running]
         return sum(c.samples for c in counters), sum(c.lost + c.queue_dropped for c in counters)
 
-    (samples, lost), used, began = counted(), time.process_time(), time.monotonic()
+    (samples, lost), used, began = totals(), time.process_time(), time.monotonic()
     time.sleep(seconds)
     took = time.monotonic() - began
-    now, missing = counted()
+    now, missing = totals()
     share = (time.process_time() - used) / took
     print(json.dumps({'samples': (now - samples) / took, 'lost': missing - lost, 'share': share}))
     for session in running:
@@ -91,9 +91,9 @@ def measure(count: int, seconds: float) -> dict[str, float]:
     assert feeder.stdout is not None
     ports = feeder.stdout.readline().strip()
     words = ('--role', 'sessions', '--ports', ports, '--seconds', str(seconds))
-    found, _ = piped('bench.rigs', *words).communicate()
+    output, _ = piped('bench.rigs', *words).communicate()
     feeder.communicate()
-    reported: dict[str, float] = json.loads(found.splitlines()[-1])
+    reported: dict[str, float] = json.loads(output.splitlines()[-1])
     return reported
 
 
@@ -116,9 +116,9 @@ def main() -> int:
     most, count = 0, 1
     curve = Row('CPU of one rig of several in one process', '% of a core')
     while count <= args.most:
-        found = measure(count, args.seconds)
-        complete = found['lost'] == 0 and found['samples'] > 990.0 * count
-        share = np.array([100 * found['share'] / count])
+        result = measure(count, args.seconds)
+        complete = result['lost'] == 0 and result['samples'] > 990.0 * count
+        share = np.array([100 * result['share'] / count])
         curve.figures.append(figure(f'{count} rigs, {"nothing" if complete else "samples"} lost', 'ours', share))
         if not complete:
             break

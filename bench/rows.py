@@ -119,9 +119,9 @@ def notify(row: Row) -> None:
 
 
 def keep(rows: Sequence[Row], path: Path = RESULTS) -> None:
-    kept = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
-    kept.update((row.work, row) for row in rows)
-    tree = {'machine': machine(), 'rows': [asdict(row) for row in kept.values()]}
+    by_work = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
+    by_work.update((row.work, row) for row in rows)
+    tree = {'machine': machine(), 'rows': [asdict(row) for row in by_work.values()]}
     path.write_text(json.dumps(tree, indent=1) + '\n', encoding='utf-8')
 
 

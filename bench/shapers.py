@@ -53,10 +53,10 @@ def unshaped() -> float:
     return played(move())
 
 
-def residual(by: Shaper) -> float:
+def residual(shaper: Shaper) -> float:
     """Amplitude after the shaped move over that after the move as it is."""
     return (
-        played(TrajectoryShaper(by).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
+        played(TrajectoryShaper(shaper).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
         / unshaped()
     )
 

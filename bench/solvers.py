@@ -95,7 +95,7 @@ def main() -> None:
     print(f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us, exact is {ratio:.0f} times as fast')
 
     print('one block at a time, with covariance')
-    one = tuple(dots[0].tolist())
+    sample = tuple(dots[0].tolist())
     default = 0.0
     for name in SOLVERS:
         if name in ('pose', 'base_pair'):
@@ -104,14 +104,14 @@ def main() -> None:
         for label, single in (('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))):
             if label and name != 'exact':
                 continue
-            value = best_of(functools.partial(repeat, solver, one, single)) / 200
+            value = best_of(functools.partial(repeat, solver, sample, single)) / 200
             default = default or value
             print(f'  {name + label:50} {1e6 * value:9.1f} us')
-    for text, by in (
+    for text, solve in (
         ('scipy.optimize.least_squares', peer_least_squares),
         ('numpy.linalg.lstsq, linear, no covariance', peer_lstsq),
     ):
-        value = best_of(functools.partial(by, dots[:200])) / 200
+        value = best_of(functools.partial(solve, dots[:200])) / 200
         print(f'  {text:50} {1e6 * value:9.1f} us, exact is {value / default:.0f} times as fast')
 
 

@@ -75,27 +75,27 @@ def darkened(rig: Rig, light: tuple[misaligned.Light, misaligned.Light], rng: np
 
 
 def calibrated_rig(rig: Rig, run: CalibrationRun) -> tuple[Rig, Calibration]:
-    found = calibrate([run], rig)
-    values, effects = values_of(found, 'today')
+    calibration = calibrate([run], rig)
+    values, effects = values_of(calibration, 'today')
     more = flattened({'effects': effects_to_values(effects)}, 'effects') if effects else {}
-    return replace_values(rig, {**values, **more}), found
+    return replace_values(rig, {**values, **more}), calibration
 
 
 def measured(rig: Rig, volts: Array, zero_after: int = 25) -> tuple[Array, Array, Array]:
     """Blocks (n,), poses (n, 3), covariances (n, 3, 3) of a run whose zero is taken after that many blocks."""
     pipeline = Pipeline(rig)
-    found: list[DeflectionEstimate] = []
+    estimates: list[DeflectionEstimate] = []
     cut = zero_after * SIZE
     for first, part in ((0, volts[:cut]), (cut, volts[cut:])):
         records = [r for r in pipeline.process(chunk(part, first)) if isinstance(r, DeflectionEstimate) and r.primary]
         if first:
-            found += records
+            estimates += records
         elif pipeline.zero() is None:
             raise RuntimeError(f'no zero: {pipeline.zero_rejected}')
     return (
-        np.array([e.block for e in found]),
-        np.array([e.pose for e in found]),
-        np.array([e.covariance for e in found]).reshape(-1, 3, 3),
+        np.array([e.block for e in estimates]),
+        np.array([e.pose for e in estimates]),
+        np.array([e.covariance for e in estimates]).reshape(-1, 3, 3),
     )
 
 
@@ -103,12 +103,12 @@ def shares_left_open(truth: Mapping[str, float], pose: Array, frames: npt.NDArra
     """Of each parameter the standard deviation after over before, by this generator's own derivatives."""
     at = pose[frames][::4]
     names = list(truth)
-    spread = np.array([misaligned.tolerance(n) for n in names])
+    tolerances = np.array([misaligned.tolerance(n) for n in names])
     slopes = np.empty((len(at), 4, len(names)))
     for i, name in enumerate(names):
         up, down = dict(truth), dict(truth)
-        up[name] += 1e-2 * spread[i]
-        down[name] -= 1e-2 * spread[i]
+        up[name] += 1e-2 * tolerances[i]
+        down[name] -= 1e-2 * tolerances[i]
         slopes[:, :, i] = (misaligned.dots(up, at) - misaligned.dots(down, at)) / 2e-2
     by_pose = np.empty((len(at), 4, 3))
     for i, step in enumerate((1e-6, 1e-6, 1e-5)):
@@ -120,8 +120,8 @@ def shares_left_open(truth: Mapping[str, float], pose: Array, frames: npt.NDArra
     covariance = np.einsum('nij,nkj->nik', moved, moved) + dot * np.eye(4)
     weighted = np.linalg.solve(covariance, slopes)
     information = 4.0 * np.einsum('nij,nik->jk', slopes, weighted)
-    left = np.linalg.inv(information + np.eye(len(names)))
-    return dict(zip(names, np.sqrt(np.diag(left)).tolist(), strict=True))
+    posterior = np.linalg.inv(information + np.eye(len(names)))
+    return dict(zip(names, np.sqrt(np.diag(posterior)).tolist(), strict=True))
 
 
 def shifted(truth: Mapping[str, float], group: str, rng: np.random.Generator) -> dict[str, float]:
@@ -141,12 +141,12 @@ def score(seed: int, lit: bool = False) -> Score:
     first = misaligned.draw_light(rng) if lit else None
     recorded = misaligned.record(truth, pose, rng, outliers=0.01, light=first)
     nominal = rig_from_values({})
-    rig, found = calibrated_rig(nominal if first is None else darkened(nominal, first, rng), run_of(recorded))
+    rig, calibration = calibrated_rig(nominal if first is None else darkened(nominal, first, rng), run_of(recorded))
     light = None if first is None else misaligned.relit(first, rng)
     if light is not None:
         rig = darkened(rig, light, rng)
-    sd = found.sd
-    z = {n: float((found.values[i] - truth[n]) / sd[i]) for i, n in enumerate(NAMES) if n in truth}
+    sd = calibration.sd
+    z = {n: float((calibration.values[i] - truth[n]) / sd[i]) for i, n in enumerate(NAMES) if n in truth}
     later = misaligned.poses(misaligned.pushes(rng, AFTER, AFTER_SECONDS))
     volts = misaligned.record(truth, later, rng, light=light).volts
     middle = generator.between(later)
@@ -154,17 +154,17 @@ def score(seed: int, lit: bool = False) -> Score:
     error = estimate - middle[block]
     distance = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error)
     _, _, noise = measured(replace_values(rig, {'covariance': 'noise', 'consistency': 'report'}), volts)
-    far = np.einsum('ni,nij,nj->n', error, np.linalg.inv(noise), error)
+    noise_distance = np.einsum('ni,nij,nj->n', error, np.linalg.inv(noise), error)
     block_0, estimate_0, _ = measured(nominal, volts)
     error_0 = estimate_0 - middle[block_0]
-    alone = {next(iter(d.parts)) for d in found.undetermined if len(d.parts) == 1}
+    alone = {next(iter(d.parts)) for d in calibration.undetermined if len(d.parts) == 1}
     shares = shares_left_open(truth, pose, recorded.frames)
-    own = {n: s for n, s in shares.items() if n in NAMES}
+    package_shares = {n: s for n, s in shares.items() if n in NAMES}
     # Told alone, or as the largest part of what moves together.
-    reported = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in found.undetermined}
-    every = {n for d in found.undetermined for n in d.parts}
-    unreported = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
-    message = [n for n in reported & alone if own.get(n, 1.0) < OPEN - BORDER]
+    reported = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in calibration.undetermined}
+    every = {n for d in calibration.undetermined for n in d.parts}
+    unreported = [n for n, s in package_shares.items() if s > OPEN + BORDER and n not in every]
+    message = [n for n in reported & alone if package_shares.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
     again = misaligned.record(
         shifted(truth, group, rng) if group else truth, later_motion(rng), rng, outliers=0.01, light=light
@@ -175,10 +175,10 @@ def score(seed: int, lit: bool = False) -> Score:
         z,
         float(np.mean(distance <= CHI95)),
         axes.mean(axis=0),
-        float(np.mean(far <= CHI95)),
+        float(np.mean(noise_distance <= CHI95)),
         np.sqrt(np.mean(error_0**2, axis=0)),
         np.sqrt(np.mean(error**2, axis=0)),
-        (found.gap.heldout_before, found.gap.heldout_after),
+        (calibration.gap.heldout_before, calibration.gap.heldout_after),
         unreported,
         message,
         group,
@@ -193,9 +193,11 @@ def errors_over_sd(seed: int, reference: float) -> dict[str, float]:
     truth = misaligned.draw(rng)
     sigma = generator.SIGMA * np.exp(rng.uniform(np.log(0.25), np.log(2.0), 6))
     pose = misaligned.poses(misaligned.pushes(rng, HOLDS, SECONDS))
-    spread = [reference * sd for sd in misaligned.CAMERA]
-    found = calibrate([run_of(misaligned.record(truth, pose, rng, sigma=sigma, spread=spread))], rig_from_values({}))
-    return {n: float((found.values[i] - truth[n]) / found.sd[i]) for i, n in enumerate(NAMES) if n in truth}
+    sds = [reference * sd for sd in misaligned.CAMERA]
+    calibration = calibrate(
+        [run_of(misaligned.record(truth, pose, rng, sigma=sigma, reference_sd=sds))], rig_from_values({})
+    )
+    return {n: float((calibration.values[i] - truth[n]) / calibration.sd[i]) for i, n in enumerate(NAMES) if n in truth}
 
 
 REFERENCE_SCALE = 5e-4  # Relative standard deviation of the lengths, and of the angles, of the reference.
@@ -231,11 +233,11 @@ def certified(seed: int) -> Certified:
     lengths, angles = (1.0 + rng.normal(0.0, REFERENCE_SCALE, 2)).tolist()
     recorded = misaligned.record(truth, pose, rng)
     scaled = replace(recorded, reference=recorded.reference * (lengths, lengths, angles))
-    rig, found = calibrated_rig(rig_from_values({}), run_of(scaled))
+    rig, calibration = calibrated_rig(rig_from_values({}), run_of(scaled))
     poses = rng.uniform(-1.0, 1.0, (STATED, 3)) * (2e-3, 2e-3, 0.015)
     inputs = read_inputs(None, CERTIFIED, declared=(*INPUTS, *REFERENCE_INPUTS))
     asked = [(x, y, theta) for x, y, theta in poses.tolist()]
-    stated = certify(CertificateProblem(rig, result(found, 'today'), inputs, asked)).stated
+    stated = certify(CertificateProblem(rig, result(calibration, 'today'), inputs, asked)).stated
     held = np.repeat(np.vstack((np.zeros(3), poses)), [25 * SIZE, *([HELD * SIZE] * STATED)], axis=0)
     volts = misaligned.record(truth, held, rng).volts
     beams = rng.normal(0.0, POINTING * misaligned.LENGTH, 4)
@@ -245,13 +247,13 @@ def certified(seed: int) -> Certified:
     _, estimates, _ = measured(replace_values(rig, {'covariance': 'noise', 'consistency': 'report'}), volts)
     # The last block of each pose: the step to it is over.
     error = estimates[HELD - 1 :: HELD] - poses
-    uncertainty = np.stack([one.uncertainty for one in stated])
+    uncertainty = np.stack([c.uncertainty for c in stated])
     return Certified(np.abs(error) <= uncertainty, error / uncertainty)
 
 
 def table_of_certificates(rigs: Sequence[Certified]) -> Iterator[str]:
-    covered = np.stack([one.covered for one in rigs])
-    ratio = np.sqrt(np.mean(np.stack([one.ratio for one in rigs]) ** 2, axis=(0, 1)))
+    covered = np.stack([rig.covered for rig in rigs])
+    ratio = np.sqrt(np.mean(np.stack([rig.ratio for rig in rigs]) ** 2, axis=(0, 1)))
     yield '| | ΔX | ΔY | θ | all |\n|---|---|---|---|---|'
     x, y, t = covered.mean(axis=(0, 1)).tolist()
     words = f'U covers the error, {len(rigs)} rigs of {STATED} poses'

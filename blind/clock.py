@@ -90,11 +90,11 @@ def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
     score = Score([])
     for seed in runs:
         run = simulated(seed, seconds=4.0, steps=(1.0, 2.7), exposure=exposure)
-        found: Offset = clock_offset(motion_of(run.t, run.dots), run.stamps, run.poses, exposure=exposure)
-        low, high = found.interval
-        score.errors.append(found.value - run.offset)
+        offset: Offset = clock_offset(motion_of(run.t, run.dots), run.stamps, run.poses, exposure=exposure)
+        low, high = offset.interval
+        score.errors.append(offset.value - run.offset)
         score.inside += low <= run.offset <= high
-        score.reported += found.determined
+        score.reported += offset.determined
     return score
 
 

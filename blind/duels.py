@@ -73,10 +73,10 @@ def bent(plant: Plant, y: FloatArray) -> Residual:
         def apart(x: FloatArray) -> FloatArray:
             return y - _vector(plant.simulate(_model(used, x)))
 
-        def some(x: FloatArray) -> FloatArray:
+        def subset(x: FloatArray) -> FloatArray:
             return apart(x)[observed]
 
-        return apart(np.asarray(least_squares(some, start, bounds=(low, high), x_scale=size).x))
+        return apart(np.asarray(least_squares(subset, start, bounds=(low, high), x_scale=size).x))
 
     return residual
 
@@ -84,18 +84,18 @@ def bent(plant: Plant, y: FloatArray) -> Residual:
 def forward_backward(plant: Plant, residual: Residual, observed: BoolArray) -> FloatArray:
     """What is left of all values by terms chosen by BIC, one added or dropped at a time, from the ``observed``."""
     count = int(observed.sum())
-    kept: dict[frozenset[int], FloatArray] = {}
+    residuals: dict[frozenset[int], FloatArray] = {}
 
     def bic(chosen: frozenset[int]) -> float:
-        if chosen not in kept:
-            kept[chosen] = residual([plant.library[j] for j in sorted(chosen)], observed)
-        return float(count * np.log(np.sum(kept[chosen][observed] ** 2)) + len(chosen) * np.log(count))
+        if chosen not in residuals:
+            residuals[chosen] = residual([plant.library[j] for j in sorted(chosen)], observed)
+        return float(count * np.log(np.sum(residuals[chosen][observed] ** 2)) + len(chosen) * np.log(count))
 
     chosen: frozenset[int] = frozenset()
     while True:
         best = min((chosen ^ {j} for j in range(len(plant.library))), key=bic)
         if not bic(best) < bic(chosen):
-            return kept[chosen]
+            return residuals[chosen]
         chosen = best
 
 
@@ -162,14 +162,14 @@ def nested(make: Callable[[], Plant], is_linear: bool) -> Iterator[tuple[str, fl
         yield name, rms(rest[np.isfinite(rest)])
 
 
-def found_model(found: PlantDiscovery) -> Model:
-    every = (*(e.active for e in found.effects), *(a for a, _ in found.nuisance))
+def model_of(discovery: PlantDiscovery) -> Model:
+    every = (*(e.active for e in discovery.effects), *(a for a, _ in discovery.nuisance))
     return {a.effect.name: dict(a.values) for a in every}
 
 
-def of_emps(data: Path, found: Model) -> Iterator[tuple[str, float]]:
+def of_emps(data: Path, discovered: Model) -> Iterator[tuple[str, float]]:
     """Its test record in one piece without feedback: with what was found, and with the published terms."""
-    for words, without, model in (('found', FRICTION, found), ('published', (), {})):
+    for words, without, model in (('found', FRICTION, discovered), ('published', (), {})):
         plant = Emps(without, data / 'emps', record='DATA_EMPS_PULSES.mat', segment=EMPS_S)
         (measured,), (simulated,) = plant.measured(), plant.simulate(model)
         yield f'test record, terms as {words}, rms; m', rms((measured - simulated)[0, EMPS_START:])
@@ -192,9 +192,9 @@ DUELS: Mapping[str, Duel] = {
 }
 
 
-def answered(found: PlantDiscovery) -> str:
-    words = [f'`{e.active.effect.name}` {size_of(e)}' for e in found.effects]
-    return '; '.join([*words, *(['the rest is called unknown'] if found.unknown else [])]) or 'nothing is missing'
+def answered(discovery: PlantDiscovery) -> str:
+    words = [f'`{e.active.effect.name}` {size_of(e)}' for e in discovery.effects]
+    return '; '.join([*words, *(['the rest is called unknown'] if discovery.unknown else [])]) or 'nothing is missing'
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -214,13 +214,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         duel = DUELS[name]
         make = duel.known if args.null else duel.make
         try:
-            found = discover_in(make(args.data))
-            print(f'| {name} | named | discover_in | {answered(found)} |', flush=True)
+            discovery = discover_in(make(args.data))
+            print(f'| {name} | named | discover_in | {answered(discovery)} |', flush=True)
             if args.out is not None:
-                found.save(args.out / name)
+                discovery.save(args.out / name)
             status = 0
             if not args.null and duel.test is not None:
-                for measure, figure in duel.test(args.data, found_model(found)):
+                for measure, figure in duel.test(args.data, model_of(discovery)):
                     print(f'| {name} | {measure} | discover_in | {figure:.3g} |', flush=True)
             if not args.null and not args.named:
                 unit = make(args.data).units[0]

@@ -229,15 +229,15 @@ def _clip_spot(x: Array, radius: float, profile: int) -> tuple[Array, Array]:
     if profile == 2:
         s = radius / 2.0
         a, b = (-half - x) / s, (half - x) / s
-        left = norm.cdf(b) - norm.cdf(a)
-        return x + s * (norm.pdf(a) - norm.pdf(b)) / left, left
+        transmitted = norm.cdf(b) - norm.cdf(a)
+        return x + s * (norm.pdf(a) - norm.pdf(b)) / transmitted, transmitted
     # Strips of an even disc, by trapezoids at the angles where they are equally fine: no closed form here.
     angle = np.linspace(0.0, np.pi, 100_001)
     u, weight = -np.cos(angle), np.sin(angle) ** 2
     step = angle[1]
     full = np.concatenate(([0.0], np.cumsum(0.5 * step * (weight[1:] + weight[:-1]))))
-    turn = weight * u
-    first = np.concatenate(([0.0], np.cumsum(0.5 * step * (turn[1:] + turn[:-1]))))
+    first_moment = weight * u
+    first = np.concatenate(([0.0], np.cumsum(0.5 * step * (first_moment[1:] + first_moment[:-1]))))
     hi = np.arccos(-np.clip((half - x) / radius, -1.0, 1.0))
     lo = np.arccos(-np.clip((-half - x) / radius, -1.0, 1.0))
     light = np.interp(hi, angle, full) - np.interp(lo, angle, full)
@@ -257,8 +257,8 @@ def sensors(dots: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> tupl
 
         for e in mine('spot_clipping'):
             for c in cols:
-                m[:, c], left = _clip_spot(m[:, c], e['radius'], int(e['profile']))
-                light[:, i] *= left
+                m[:, c], transmitted = _clip_spot(m[:, c], e['radius'], int(e['profile']))
+                light[:, i] *= transmitted
         for e in mine('ambient_light'):
             share = e['level'] / (light[:, i] + e['level'])
             m[:, cols[0]] += share * (e['x'] - m[:, cols[0]])
@@ -324,8 +324,8 @@ def electronics(m: Array, light: Array, t: Array, effects: Sequence[Spec]) -> Ar
         decay = math.exp(-STEP / tau)
         # The response to a straight piece of input, solved by hand.
         ahead = 1.0 - tau / STEP * (1.0 - decay)
-        behind = 1.0 - decay - ahead
-        driven = behind * fine[:-1] + ahead * fine[1:]
+        previous = 1.0 - decay - ahead
+        driven = previous * fine[:-1] + ahead * fine[1:]
         fine = lfilter([1.0], [1.0, -decay], np.vstack((fine[:1], driven)), axis=0)
     volts = fine[::FINER].copy()
     at = t[::FINER]

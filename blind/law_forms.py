@@ -63,8 +63,8 @@ def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
         # A delay of one's own reading is in the catalogue.
         of = [DOTS[DOTS.index(where) ^ 1]]
     if form == 'product':
-        others = [n for n in ((*LOADS, 'temperature') if stage in ('load', 'optics') else DOTS) if n not in of]
-        of.append(str(rng.choice(others)))
+        candidates = [n for n in ((*LOADS, 'temperature') if stage in ('load', 'optics') else DOTS) if n not in of]
+        of.append(str(rng.choice(candidates)))
     if form == 'events':
         of = []
     times = np.sort(rng.uniform(2.0, 22.0, int(rng.integers(1, 5)))).tolist() if 'events' in form else []
@@ -102,7 +102,7 @@ def lag(u: Array, tau: float, step: float) -> Array:
 def _mode(u: Array, frequency: float, step: float) -> Array:
     """Return a resonance of damping ratio 0.02, by small steps of a rotation that fades."""
     w, zeta = 2.0 * math.pi * frequency, 0.02
-    turn = np.exp(step * (-zeta * w + 1j * w * math.sqrt(1.0 - zeta**2)))
+    pole = np.exp(step * (-zeta * w + 1j * w * math.sqrt(1.0 - zeta**2)))
     out = np.empty(len(u))
     z, before = 0j, 0.0
     lean = zeta / math.sqrt(1.0 - zeta**2)
@@ -111,7 +111,7 @@ def _mode(u: Array, frequency: float, step: float) -> Array:
         z -= (v - before) * (1.0 - 1j * lean)
         before = v
         out[i] = v + z.real
-        z *= turn
+        z *= pole
     return out
 
 

@@ -41,8 +41,8 @@ def drawn(first: int, count: int) -> list[dict[str, Any]]:
         if i % 12 == 0:
             used.clear()
         rng = np.random.default_rng((20261122, i))
-        left = [f for f in law_forms.OF_STAGE[stage] if f not in used] or list(law_forms.OF_STAGE[stage])
-        form = str(rng.choice(left))
+        unused = [f for f in law_forms.OF_STAGE[stage] if f not in used] or list(law_forms.OF_STAGE[stage])
+        form = str(rng.choice(unused))
         used.add(form)
         law = next(filter(_shows, (law_forms.draw(zlib.crc32(text.encode()), stage, form) for text in _seeds(i))))
         gap = float(np.exp(rng.uniform(math.log(5.0), math.log(30.0))))
@@ -84,8 +84,8 @@ def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
 
 
 def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
-    found = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
-    return found.tree(), found
+    discovery = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
+    return discovery.tree(), discovery
 
 
 def evaluated(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
@@ -158,13 +158,13 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         alone = sum(r[f'{name}_alone'] for r in laws)
         good = n == 0 or k >= WANTED[name] * n
         passed &= good
-        counted = f'{k}/{n} (wanted {100 * WANTED[name]:.0f} %); named itself: {alone}/{n}'
-        lines.append(bound_line(good, f'{words}, named or listed as equivalent: {counted}'))
-    near, n = sum(r['floors'] <= MOST_FLOORS for r in laws), len(laws)
-    good = n == 0 or near >= WANTED['gap'] * n
+        proportion = f'{k}/{n} (wanted {100 * WANTED[name]:.0f} %); named itself: {alone}/{n}'
+        lines.append(bound_line(good, f'{words}, named or listed as equivalent: {proportion}'))
+    n_close, n = sum(r['floors'] <= MOST_FLOORS for r in laws), len(laws)
+    good = n == 0 or n_close >= WANTED['gap'] * n
     alarms = sum(r['alarm'] for r in nulls)
     passed &= good and alarms == 0
-    share = f'{near}/{n} (wanted {100 * WANTED["gap"]:.0f} %)'
+    share = f'{n_close}/{n} (wanted {100 * WANTED["gap"]:.0f} %)'
     lines.append(bound_line(good, f'gap on unseen load cases at most {MOST_FLOORS} floors: {share}'))
     unwanted = f'{alarms}/{len(nulls)} (wanted 0)'
     lines.append(bound_line(alarms == 0, f'laws where nothing is missing: {unwanted}'))

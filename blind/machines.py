@@ -190,11 +190,11 @@ class AuxTel(Plant):
     def _picture(self, name: str) -> FloatArray:
         """(2, n): what 1 arcsec of a term does across and up."""
         a, e = self.azimuth, self.elevation
-        none, one = np.zeros_like(a), np.ones_like(a)
+        none, ones = np.zeros_like(a), np.ones_like(a)
         physical: dict[str, tuple[FloatArray, FloatArray]] = {
             'IA': (np.cos(e), none),
-            'IE': (none, one),
-            'CA': (one, none),
+            'IE': (none, ones),
+            'CA': (ones, none),
             'NPAE': (np.sin(e), none),
             'AN': (np.sin(a) * np.sin(e), np.cos(a)),
             'AW': (np.cos(a) * np.sin(e), -np.sin(a)),

@@ -64,31 +64,31 @@ def dots(rig: Mapping[str, float], pose: Array) -> Array:
     n = len(pose)
     k = rig['link.slope_ratio'] / LENGTH
     theta, phi, omega = pose[:, 2], -k * pose[:, 1], k * pose[:, 0]
-    zero, one = np.zeros(n), np.ones(n)
+    zero, ones = np.zeros(n), np.ones(n)
 
     def matrix(rows: Sequence[Sequence[Array]]) -> Array:
         return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
-    about_z = matrix([(np.cos(theta), -np.sin(theta), zero), (np.sin(theta), np.cos(theta), zero), (zero, zero, one)])
-    about_x = matrix([(one, zero, zero), (zero, np.cos(phi), -np.sin(phi)), (zero, np.sin(phi), np.cos(phi))])
-    about_y = matrix([(np.cos(omega), zero, np.sin(omega)), (zero, one, zero), (-np.sin(omega), zero, np.cos(omega))])
-    turn = about_y @ about_x @ about_z
+    about_z = matrix([(np.cos(theta), -np.sin(theta), zero), (np.sin(theta), np.cos(theta), zero), (zero, zero, ones)])
+    about_x = matrix([(ones, zero, zero), (zero, np.cos(phi), -np.sin(phi)), (zero, np.sin(phi), np.cos(phi))])
+    about_y = matrix([(np.cos(omega), zero, np.sin(omega)), (zero, ones, zero), (-np.sin(omega), zero, np.cos(omega))])
+    rotation = about_y @ about_x @ about_z
     tip = np.column_stack((pose[:, :2], np.full(n, LENGTH)))
     out = np.empty((n, 4))
     for i, (fx, fy) in enumerate(generator.PLACES):
-        own = {
+        channel = {
             name.partition('.')[2]: v for name, v in rig.items() if name.startswith((f'psd_{i + 1}.', f'beam_{i + 1}.'))
         }
-        along = np.array([math.tan(own['angle_x']), math.tan(own['angle_y']), 1.0])
-        start = np.array([fx + own['x'], fy + own['y'], LENGTH + own['height']])
-        origin = tip + turn @ np.array([own['center_x'], own['center_y'], own['height']])
+        along = np.array([math.tan(channel['angle_x']), math.tan(channel['angle_y']), 1.0])
+        start = np.array([fx + channel['x'], fy + channel['y'], LENGTH + channel['height']])
+        origin = tip + rotation @ np.array([channel['center_x'], channel['center_y'], channel['height']])
         # origin + a ex + b ey = start + s along
-        system = np.stack((turn[:, :, 0], turn[:, :, 1], np.tile(-along, (n, 1))), axis=2)
+        system = np.stack((rotation[:, :, 0], rotation[:, :, 1], np.tile(-along, (n, 1))), axis=2)
         a = np.linalg.solve(system, (start - origin)[:, :, None])[:, :, 0]
-        z = (a[:, 0] + 1j * a[:, 1]) * np.exp(-1j * own['rotation'])
-        z = z * (1.0 + own['nonlinearity'] * np.abs(z) ** 2)
-        out[:, 2 * i] = (1.0 + own['gain_x']) * (z.real + own['crosstalk_xy'] * z.imag)
-        out[:, 2 * i + 1] = (1.0 + own['gain_y']) * (z.imag + own['crosstalk_yx'] * z.real)
+        z = (a[:, 0] + 1j * a[:, 1]) * np.exp(-1j * channel['rotation'])
+        z = z * (1.0 + channel['nonlinearity'] * np.abs(z) ** 2)
+        out[:, 2 * i] = (1.0 + channel['gain_x']) * (z.real + channel['crosstalk_xy'] * z.imag)
+        out[:, 2 * i + 1] = (1.0 + channel['gain_y']) * (z.imag + channel['crosstalk_yx'] * z.real)
     return out
 
 
@@ -133,14 +133,14 @@ DARK = Light(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 def draw_light(rng: np.random.Generator) -> tuple[Light, Light]:
     """On both PSDs: 1 to 4 % of the light, anywhere within 2 mm; offsets of 10 mV, of the sum 5 mV (1 sd)."""
 
-    def one() -> Light:
+    def random_light() -> Light:
         return Light(
             float(rng.uniform(0.05, 0.2)),
             *rng.uniform(-4.0, 4.0, 2).tolist(),
             *rng.normal(0.0, (0.010, 0.010, 0.005)).tolist(),
         )
 
-    return one(), one()
+    return random_light(), random_light()
 
 
 def relit(light: tuple[Light, Light], rng: np.random.Generator) -> tuple[Light, Light]:
@@ -154,7 +154,7 @@ def darkness(light: tuple[Light, Light], seconds: float, rng: np.random.Generato
     """Volts (n, 6) with both lasers off: white noise, slower noise (20 ms) as large, the mains' flicker on the sums."""
     n = round(seconds * generator.RATE)
     flat = np.zeros(n)
-    volts = np.column_stack([column for one in light for column in one.measured(0.0, flat, flat)])
+    volts = np.column_stack([column for side in light for column in side.measured(0.0, flat, flat)])
     keep = math.exp(-1.0 / (0.020 * generator.RATE))
     kicks = rng.normal(0.0, generator.SIGMA * math.sqrt(1.0 - keep**2), (n, 6))
     volts += lfilter([1.0], [1.0, -keep], kicks, axis=0) + rng.normal(0.0, generator.SIGMA, (n, 6))
@@ -179,7 +179,7 @@ def record(
     rng: np.random.Generator,
     *,
     every: int = 33,
-    spread: Sequence[float] = CAMERA,
+    reference_sd: Sequence[float] = CAMERA,
     outliers: float = 0.0,
     sigma: float | Array = generator.SIGMA,
     light: tuple[Light, Light] | None = None,
@@ -189,11 +189,11 @@ def record(
     read = dots(rig, pose) / generator.MM_PER_V
     both = (DARK, DARK) if light is None else light
     columns = [
-        column for i, one in enumerate(both) for column in one.measured(LASER, read[:, 2 * i], read[:, 2 * i + 1])
+        column for i, side in enumerate(both) for column in side.measured(LASER, read[:, 2 * i], read[:, 2 * i + 1])
     ]
     volts = np.column_stack(columns) + rng.normal(0.0, sigma, (len(pose), 6))
     frames = np.arange(17, len(pose) - 17, every)
-    reference = pose[frames] + rng.normal(size=(len(frames), 3)) * spread
+    reference = pose[frames] + rng.normal(size=(len(frames), 3)) * reference_sd
     wrong = rng.random(len(frames)) < outliers
     reference[wrong] += rng.uniform(-1.0, 1.0, (int(wrong.sum()), 3)) * (1e-3, 1e-3, 1e-2)
     return Recorded(generator.output(volts, []), frames, reference)

@@ -44,9 +44,9 @@ def _rig(name: str) -> Make:
 
 
 def _zero(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    turn = rng.choice((-1.0, 1.0), 4)
+    signs = rng.choice((-1.0, 1.0), 4)
     shift = np.zeros(6)
-    shift[[0, 1, 3, 4]] = size / o.rig.amplifier.sensitivity * turn * rng.uniform(0.5, 1.0, 4)
+    shift[[0, 1, 3, 4]] = size / o.rig.amplifier.sensitivity * signs * rng.uniform(0.5, 1.0, 4)
     half = len(o.volts) // 2
     first = dataclasses.replace(o, name='first', volts=o.volts[:half], loads=o.loads[:half])
     rest = dataclasses.replace(o, name='second', volts=o.volts[half:] + shift, loads=o.loads[half:])
@@ -72,9 +72,9 @@ def _stuck(size: float, o: Observation, rng: np.random.Generator) -> list[Observ
 
 
 def _jump(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    volts, psd, turn = o.volts.copy(), int(rng.integers(0, 2)), rng.uniform(0.0, 2.0 * np.pi)
+    volts, psd, angle = o.volts.copy(), int(rng.integers(0, 2)), rng.uniform(0.0, 2.0 * np.pi)
     start = int(rng.uniform(0.2, 0.8) * len(volts))
-    along = np.array([np.cos(turn), np.sin(turn)]) * size / o.rig.amplifier.sensitivity
+    along = np.array([np.cos(angle), np.sin(angle)]) * size / o.rig.amplifier.sensitivity
     volts[start:, 3 * psd : 3 * psd + 2] += along
     return _of(o, volts=volts)
 

@@ -96,15 +96,15 @@ class Score:
     inside: list[tuple[bool, bool]] = field(default_factory=list)
     missed: int = 0
 
-    def add(self, found: tuple[Mode, ...], hertz: float, zeta: float) -> None:
-        if not found or abs(found[0].frequency / hertz - 1.0) > 0.2:
+    def add(self, modes: tuple[Mode, ...], hertz: float, zeta: float) -> None:
+        if not modes or abs(modes[0].frequency / hertz - 1.0) > 0.2:
             self.missed += 1
             return
-        best = found[0]
+        best = modes[0]
         self.frequency.append(best.frequency / hertz - 1.0)
         self.damping.append(best.damping / zeta - 1.0)
-        near = abs(best.frequency - hertz) <= 1.96 * best.frequency_sd
-        self.inside.append((near, abs(best.damping - zeta) <= 1.96 * best.damping_sd))
+        close = abs(best.frequency - hertz) <= 1.96 * best.frequency_sd
+        self.inside.append((close, abs(best.damping - zeta) <= 1.96 * best.damping_sd))
 
 
 class Case(NamedTuple):
@@ -136,9 +136,9 @@ def scored(seeds: Iterable[int], case: Case) -> Score:
         if case.beside:
             link = Link(((hertz, zeta, 0.5), (case.beside * hertz, zeta, 0.5)))
         samples = driven(link, rng) if case.operation else rung(link, rng, equal=case.equal)
-        found = modes_of(samples, RATE).modes
+        modes = modes_of(samples, RATE).modes
         # Of two modes the one that is nearest.
-        score.add(tuple(sorted(found, key=lambda m: abs(m.frequency - hertz)) if case.beside else found), hertz, zeta)
+        score.add(tuple(sorted(modes, key=lambda m: abs(m.frequency - hertz)) if case.beside else modes), hertz, zeta)
     return score
 
 

@@ -69,9 +69,9 @@ def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
     else:
         for axis in range(3):
             # A force that forgets in 0.2 s.
-            kept = math.exp(-1.0 / (RATE * 0.2))
-            new = rng.normal(0.0, 0.2 * most[axis] * math.sqrt(1.0 - kept * kept), n - rest)
-            out[rest:, axis] = lfilter([1.0], [1.0, -kept], new)
+            decay = math.exp(-1.0 / (RATE * 0.2))
+            new = rng.normal(0.0, 0.2 * most[axis] * math.sqrt(1.0 - decay * decay), n - rest)
+            out[rest:, axis] = lfilter([1.0], [1.0, -decay], new)
     return out
 
 
@@ -89,7 +89,7 @@ def moved(loads: Array) -> tuple[Array, Array]:
     return pose, velocity
 
 
-def turns(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def joint_motion(t: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Rates of turn (n, 3), rad/s, and angular accelerations (n, 3), rad/s^2, at times ``t`` of a base on three joints.
     Each joint moves again and again: it speeds up, goes on and slows down, with steps of the acceleration or with
     raised cosines."""
@@ -116,9 +116,9 @@ def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple
     n, h = round(seconds * RATE), 1.0 / (RATE * PARTS)
     # Each step from just after its begin to just before its end.
     t = (np.arange(n * PARTS)[:, None] * h + np.array([1e-9, 0.5 * h, h - 1e-9])).ravel()
-    rates, accelerations = turns(t, rng)
-    behind = np.array([0.0, 0.0, BEHIND])
-    base = np.cross(accelerations, behind) + np.cross(rates, np.cross(rates, behind))
+    rates, accelerations = joint_motion(t, rng)
+    offset = np.array([0.0, 0.0, BEHIND])
+    base = np.cross(accelerations, offset) + np.cross(rates, np.cross(rates, offset))
     (wx, wy, wz), (ax, ay, az) = rates.T, accelerations.T
     w, zeta = 2.0 * math.pi * np.array(MODES)[:, 0], np.array(MODES)[:, 1]
     system, force = np.zeros((len(t), 6, 6)), np.zeros((len(t), 6))
@@ -143,7 +143,7 @@ def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple
         y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     # The mean over the time for which each holds: how far the rate of turn goes in it.
     reported = tuple(
-        BaseAcceleration(i * REPORTED * 1_000_000, tuple(np.cross(mean, behind).tolist()), tuple(mean.tolist()))
+        BaseAcceleration(i * REPORTED * 1_000_000, tuple(np.cross(mean, offset).tolist()), tuple(mean.tolist()))
         for i, mean in enumerate(accelerations[1::3].reshape(-1, PARTS * REPORTED, 3).mean(axis=1))
     )
     return out[:, :3], out[:, 3:], reported
@@ -182,20 +182,20 @@ def volts_of(pose: Array, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True)
 class Result:
-    """Of B blocks in motion; (B, 3) unless said otherwise. ``velocity``, ``own``: error of the velocity at the end of a
-    block, and the standard deviation that it is given. ``smoothed``: error of the best Savitzky-Golay filter in the
-    middle. ``squares``: NIS of a block. ``predicted``, ``held`` (20 B, 3): error of the pose at each sample until the
-    next block is there. ``pose``, ``pose_own``. ``unseen``: error of the pose 100 ms after the block if no more samples
-    come, in standard deviations; NaN in the last five."""
+    """Of B blocks in motion; (B, 3) unless said otherwise. ``velocity``, ``velocity_sd``: error of the velocity at the
+    end of a block, and the standard deviation that it is given. ``smoothed``: error of the best Savitzky-Golay filter
+    in the middle. ``squares``: NIS of a block. ``predicted``, ``held`` (20 B, 3): error of the pose at each sample
+    until the next block is there. ``pose``, ``pose_sd``. ``unseen``: error of the pose 100 ms after the block if no more
+    samples come, in standard deviations; NaN in the last five."""
 
     velocity: Array
-    own: Array
+    velocity_sd: Array
     smoothed: Array
     squares: Array
     predicted: Array
     held: Array
     pose: Array
-    pose_own: Array
+    pose_sd: Array
     unseen: Array
 
 
@@ -212,10 +212,10 @@ def pose_of(volts: Array) -> Array:
     """Pose (n, 3) of readings (n, 6): the base line between the dots gives the twist."""
     (l1, l2), dots = (complex(*place) for place in PLACES), MM_PER_V * volts
     q1, q2 = l1 + dots[:, 0] + 1j * dots[:, 1], l2 + dots[:, 3] + 1j * dots[:, 4]
-    turn = (l1 - l2) / (q1 - q2)
-    turn /= np.abs(turn)
-    moved_by = 0.5 * (l1 + l2) - turn * 0.5 * (q1 + q2)
-    return np.column_stack((moved_by.real, moved_by.imag, np.angle(turn)))
+    rotation = (l1 - l2) / (q1 - q2)
+    rotation /= np.abs(rotation)
+    moved_by = 0.5 * (l1 + l2) - rotation * 0.5 * (q1 + q2)
+    return np.column_stack((moved_by.real, moved_by.imag, np.angle(rotation)))
 
 
 def _smoothed(run: Run, part: slice) -> Array:
@@ -251,8 +251,8 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
     def there(message: BaseAcceleration) -> int:
         return round(message.t_ns / 1e9 * RATE) + late
 
-    velocity, own, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
-    pose, pose_own = np.zeros((blocks, 3)), np.zeros((blocks, 3))
+    velocity, velocity_sd, squares = np.zeros((blocks, 3)), np.zeros((blocks, 3)), np.zeros((blocks, 3))
+    pose, pose_sd = np.zeros((blocks, 3)), np.zeros((blocks, 3))
     predicted, held = np.zeros((blocks * BLOCK, 3)), np.zeros((blocks * BLOCK, 3))
     unseen = np.full((blocks, 3), np.nan)
     first = int(REST * RATE) // BLOCK
@@ -264,9 +264,9 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
             if isinstance(record, TipMotion):
                 at = BLOCK * (block + 1) - 1
                 velocity[block] = np.array([record.vx, record.vy, record.vtheta]) - run.velocity[at]
-                own[block] = np.sqrt(record.velocity_covariance[::4])
+                velocity_sd[block] = np.sqrt(record.velocity_covariance[::4])
                 pose[block] = np.array([record.dx, record.dy, record.theta]) - run.pose[at]
-                pose_own[block] = np.sqrt(record.covariance[::4])
+                pose_sd[block] = np.sqrt(record.covariance[::4])
         squares[block] = motion.innovations.since(before).squares
         estimate = pipeline.last_estimate
         if estimate is None:
@@ -286,25 +286,25 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
     part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)
     return Result(
         velocity[part],
-        own[part],
+        velocity_sd[part],
         _smoothed(run, part),
         squares[part],
         predicted[samples],
         held[samples],
         pose[part],
-        pose_own[part],
+        pose_sd[part],
         unseen[part],
     )
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one axis; rms values in m, rad, m/s, rad/s. ``velocity``: error, ``own``: what the filter says of it,
+    """Of one axis; rms values in m, rad, m/s, rad/s. ``velocity``: error, ``velocity_sd``: what the filter says of it,
     ``smoothed``: that of Savitzky and Golay. ``nis`` a sample; ``inside``: share of the blocks whose NIS is in its 95 %
     band. ``predicted``, ``held``: errors of the pose."""
 
     velocity: float
-    own: float
+    velocity_sd: float
     smoothed: float
     nis: float
     inside: float
@@ -317,13 +317,13 @@ def figures(results: Iterable[Result]) -> list[Figures]:
     low, high = (float(chi2.ppf(p, BLOCK)) for p in (0.025, 0.975))
     out = []
     for axis in range(3):
-        velocity, own, smoothed, squares, predicted, held = (
+        velocity, velocity_sd, smoothed, squares, predicted, held = (
             np.concatenate([getattr(result, name)[:, axis] for result in results])
-            for name in ('velocity', 'own', 'smoothed', 'squares', 'predicted', 'held')
+            for name in ('velocity', 'velocity_sd', 'smoothed', 'squares', 'predicted', 'held')
         )
         inside = float(np.mean((squares > low) & (squares < high)))
         nis = float(squares.mean()) / BLOCK
-        out.append(Figures(rms(velocity), rms(own), rms(smoothed), nis, inside, rms(predicted), rms(held)))
+        out.append(Figures(rms(velocity), rms(velocity_sd), rms(smoothed), nis, inside, rms(predicted), rms(held)))
     return out
 
 
@@ -345,16 +345,17 @@ def by_frequency(results: Iterable[Result]) -> list[float]:
     return out
 
 
-def table(found: Mapping[str, list[Figures]]) -> str:
+def table(by_kind: Mapping[str, list[Figures]]) -> str:
     rows = [
         '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | predicted | held |',
         '|---' * 10 + '|',
     ]
-    for kind, axes in found.items():
+    for kind, axes in by_kind.items():
         for name, f in zip(AXES, axes, strict=True):
             unit, micro = ('mm/s', 'µm') if name != 'theta' else ('mrad/s', 'µrad')
+            ratio = f.velocity / f.velocity_sd
             rows.append(
-                f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.own * 1e3:.3f} | {f.velocity / f.own:.2f} '
+                f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.velocity_sd * 1e3:.3f} | {ratio:.2f} '
                 f'| {f.velocity / f.smoothed:.3f} | {f.nis:.3f} | {f.inside:.1%} '
                 f'| {f.predicted * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
             )

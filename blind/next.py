@@ -49,8 +49,8 @@ def observed(
 ) -> Observation:
     steady = np.full(len(loads), 20.0) if temperature is None else temperature
     volts = Generator(loads, steady, length).record(truth, 'white', seed)
-    own = replace_values(RIG, {'link.length': length}) if length != RIG.link.length else RIG
-    return Observation(name, own, volts, loads, temperature)
+    rig = replace_values(RIG, {'link.length': length}) if length != RIG.link.length else RIG
+    return Observation(name, rig, volts, loads, temperature)
 
 
 def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
@@ -75,10 +75,10 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
         return {**row, 'kind': 'hidden'}
     first = observed([hidden], loads, temperature, RIG.link.length, seed, 'first')
     made: list[Observation] = []
-    left: list[list[str]] = []
+    alternatives: list[list[str]] = []
 
     def record(plan: Plan, number: int) -> Observation:
-        left.append(sorted({t.alternative for t in plan.discriminations}))
+        alternatives.append(sorted({t.alternative for t in plan.discriminations}))
         length = float(str(plan.setting.changes.get('link.length', RIG.link.length)))
         warm = plan.setting.temperature(len(plan.loads))
         made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
@@ -92,7 +92,7 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
         'recordings': len(done.plans),
         'named': named,
         'together': together,
-        'left': left,
+        'left': alternatives,
         'planned': [p.words for p in done.plans],
         'verdict': done.discovery.verdict,
         'right': named == [name] or (done.outcome != 'unique' and name in (*named, *together)),
@@ -138,8 +138,8 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     lines.append(f'separable within the limits: {len(can)}; settled and right in at most {MOST}: {len(done)}')
     lines.append(f'said to be inseparable: {len(ended)}, rightly: {sum(not r["separable"] for r in ended)}')
     middle = float(np.median(counts)) if counts else 0.0
-    counted = ', '.join(f'{counts.count(k)} with {k}' for k in range(1, MOST + 1))
-    lines.append(f'recordings needed: {counted}; median {middle:g}')
+    by_count = ', '.join(f'{counts.count(k)} with {k}' for k in range(1, MOST + 1))
+    lines.append(f'recordings needed: {by_count}; median {middle:g}')
     met = bool(can) and len(done) >= WANTED_SHARE * len(can) and middle <= WANTED_MEDIAN
     return '\n'.join(lines), met
 

@@ -142,7 +142,7 @@ def bench(folder: Path, plan: Plan) -> Bench:
         focal=2000.0 / plan.shrink,
         centre=(330.0 / plan.shrink, 228.0 / plan.shrink),
         distortion=(-0.2, 0.1, 1e-3, -1e-3),
-        turn=math.radians(rng.uniform(-2.0, 2.0)),
+        roll=math.radians(rng.uniform(-2.0, 2.0)),
         tilt=tuple(rng.uniform(-0.04, 0.04, 2)),
         slope=(0.2, -0.1),
         shot_noise=0.1,
@@ -231,20 +231,20 @@ def rig_files(made: Bench, stem: str, values: Mapping[str, object]) -> None:
 
 def curves(made: Bench, load_case: HeldLoad, stem: str) -> Curves:
     """What every method says of a recording with the rig file ``STEM.yaml``, by ``replay``."""
-    found: dict[str, Array] = {}
+    poses: dict[str, Array] = {}
     for variant in ('', *(f'_{place}' for place in WEIGHTS)):
         out = f'{load_case.name}_{stem}{variant}.csv'
         made.run('replay', f'{load_case.name}.csv', '--params-file', f'{stem}{variant}.yaml', '--out', out)
         rows = table(made.folder / out)
         for name in ('wls',) if variant else ('wls', 'iterative', 'exact'):
-            found[f'{name}{variant}'] = np.column_stack([rows[f'{name}_{axis}'] for axis in AXES])
-    return Curves(rows['t'], found)
+            poses[f'{name}{variant}'] = np.column_stack([rows[f'{name}_{axis}'] for axis in AXES])
+    return Curves(rows['t'], poses)
 
 
-def evaluated(made: Bench, load_case: HeldLoad, stem: str, by: str) -> Any:
+def evaluated(made: Bench, load_case: HeldLoad, stem: str, source: str) -> Any:
     """Return the answer of ``validate``: by the camera, its clock put right, or by the truth."""
-    reference = f'{load_case.name}_{by}.csv'
-    align = ['--align', '--exposure', str(made.plan.exposure)] if by == 'camera' else []
+    reference = f'{load_case.name}_{source}.csv'
+    align = ['--align', '--exposure', str(made.plan.exposure)] if source == 'camera' else []
     rig = ('--params-file', f'{stem}.yaml')
     words = ('--reference', reference, '--solver', 'all', *rig, *align, '--json')
     return json.loads(made.run('validate', f'{load_case.name}.csv', *words))
@@ -339,8 +339,8 @@ def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: M
             cells = []
             for force in forces:
                 answer = answers[f'link_{force:.0f}N'][f'{stem}{"_" if weights else ""}{weights} truth']
-                found = answer['solvers'][solver]
-                cells += [f'{100 * found[axis]["largest"] / scale[axis]:.3f}' for axis in SYMBOLS]
+                errors = answer['solvers'][solver]
+                cells += [f'{100 * errors[axis]["largest"] / scale[axis]:.3f}' for axis in SYMBOLS]
             rows.append((words if method == 'wls_sidebar' else '', label, *cells))
     head = [f'{force:.0f} N, {SYMBOLS[axis]}' for force in forces for axis in SYMBOLS]
     return table_of(('rig', 'method', *head), rows)
@@ -427,13 +427,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if args.out.exists() and any(args.out.iterdir()):
         parser.error(f'--out {args.out}: is not empty')
-    found = redone(args.out, replace(SHORT if args.short else Plan(), seed=args.seed))
-    for stem, axes in found['shares'].items():
+    summary = redone(args.out, replace(SHORT if args.short else Plan(), seed=args.seed))
+    for stem, axes in summary['shares'].items():
         words = ', '.join(f'{axis} {100.0 * share:.3f} %' for axis, share in axes.items())
         print(f'{stem:15s} largest error on the link: {words}')
-    answer = 'within' if found['holds'] else 'BEYOND'
-    text = f'{answer} {100.0 * found["limit"]:g} % after calibration; see {args.out / "page.html"}'
-    return conclude(text, found['holds'])
+    answer = 'within' if summary['holds'] else 'BEYOND'
+    text = f'{answer} {100.0 * summary["limit"]:g} % after calibration; see {args.out / "page.html"}'
+    return conclude(text, summary['holds'])
 
 
 if __name__ == '__main__':

@@ -30,7 +30,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Scene:
-    """Camera, target and light. ``turn``: of the camera about its axis; ``tilt``: of the camera about X and Y."""
+    """Camera, target and light. ``roll``: of the camera about its axis; ``tilt``: of the camera about X and Y."""
 
     width: int = 640
     height: int = 480
@@ -38,7 +38,7 @@ class Scene:
     centre: tuple[float, float] = (330.0, 228.0)
     distortion: Sequence[float] = ()
     distance: float = 0.4
-    turn: float = 0.0
+    roll: float = 0.0
     tilt: tuple[float, float] = (0.0, 0.0)
     aim: tuple[float, float] = (0.0, 0.0)
     view: str = 'outside'
@@ -69,7 +69,7 @@ def about(axis: int, angle: float) -> Array:
 
 def camera_of(scene: Scene) -> tuple[Array, Array]:
     facing = np.diag([1.0, -1.0, -1.0]) if scene.view == 'outside' else np.diag([-1.0, -1.0, 1.0])
-    rotation = about(2, scene.turn) @ about(0, scene.tilt[0]) @ about(1, scene.tilt[1]) @ facing
+    rotation = about(2, scene.roll) @ about(0, scene.tilt[0]) @ about(1, scene.tilt[1]) @ facing
     return rotation, np.array([scene.aim[0], scene.aim[1], scene.distance])
 
 
@@ -118,8 +118,8 @@ def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array
     tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
     at = origin + rotation @ np.array([pose.dx, pose.dy, pose.z])
     normal = tip[:, 2]
-    far = (normal @ at) / (normal[0] * x + normal[1] * y + normal[2])
-    px, py, pz = far * x - at[0], far * y - at[1], far - at[2]
+    depth = (normal @ at) / (normal[0] * x + normal[1] * y + normal[2])
+    px, py, pz = depth * x - at[0], depth * y - at[1], depth - at[2]
     return (tip[0, 0] * px + tip[1, 0] * py + tip[2, 0] * pz, tip[0, 1] * px + tip[1, 1] * py + tip[2, 1] * pz)
 
 
@@ -149,8 +149,8 @@ def cover(out: Array, scene: Scene, pose: Pose, parts: int) -> None:
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
-        turns = np.linspace(0, 2 * np.pi, 60)
-        rim = pixels_of(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(turns), np.sin(turns))))
+        angles = np.linspace(0, 2 * np.pi, 60)
+        rim = pixels_of(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(angles), np.sin(angles))))
         u0, v0 = np.maximum(np.floor(rim.min(axis=0)).astype(int) - 2, 0)
         u1, v1 = np.ceil(rim.max(axis=0)).astype(int) + 3
         u1, v1 = min(u1, scene.width), min(v1, scene.height)

@@ -54,9 +54,9 @@ def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
         return observed(case.mistake, designs(case.design)[0], rig, case.noise, case.seed)
     out = []
     for i, g in enumerate(designs(case.design)):
-        own = replace_values(rig, {'link.length': g.length}) if g.length != rig.link.length else rig
+        rig_of_length = replace_values(rig, {'link.length': g.length}) if g.length != rig.link.length else rig
         volts = g.record(truth, case.noise, case.seed + i)
-        out.append(Observation(f'recording {i + 1}', own, volts, g.loads, g.temperature))
+        out.append(Observation(f'recording {i + 1}', rig_of_length, volts, g.loads, g.temperature))
     return out
 
 
@@ -64,8 +64,8 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
     # A mistake may change the rig, the loads or the length of the recording.
     bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
     observed = observe(case, truth)
-    found = discover(observed, _rig(case, observed), seed=0, without=case.without, bank=bank)
-    return found.tree(), found
+    discovery = discover(observed, _rig(case, observed), seed=0, without=case.without, bank=bank)
+    return discovery.tree(), discovery
 
 
 def _rig(case: Case, observed: Sequence[Observation]) -> Rig:

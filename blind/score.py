@@ -67,18 +67,18 @@ def load(folder: Path, keys: Sequence[str]) -> list[Row]:
         if not answer.exists():
             continue
         sealed = json.loads((folder / 'sealed' / f'{key}.json').read_text())
-        case, found = sealed['case'], complete(json.loads(answer.read_text()))
+        case, result = sealed['case'], complete(json.loads(answer.read_text()))
         gap = max((g for _, g in case['wanted']), default=0.0)
         apart = case['design'] == 'two' or not any(n in SHOWS_ACROSS_LENGTHS for n, _ in case['wanted'])
         wrong = tuple(sealed.get('wrong', ()))
-        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], found, case['mistake'][0], wrong))
+        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], result, case['mistake'][0], wrong))
     return out
 
 
 def share(k: int, n: int) -> str:
     """k of n, with the interval of Clopper and Pearson, 95 %."""
-    found = binomtest(k, n).proportion_ci()
-    return f'{100 * k / n:.1f} % ({k}/{n}; 95 %: {100 * found.low:.1f} to {100 * found.high:.1f})'
+    interval = binomtest(k, n).proportion_ci()
+    return f'{100 * k / n:.1f} % ({k}/{n}; 95 %: {100 * interval.low:.1f} to {100 * interval.high:.1f})'
 
 
 def covered(row: Row) -> list[tuple[str, bool]]:
@@ -253,16 +253,16 @@ def _score_by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
     if not of:
         return
     reported = [[_reported(w, r.answer['setup']) for w in r.wrong] for r in of]
-    found = [_names_all(r) for r in of]
+    named_all = [_names_all(r) for r in of]
     false = [_names_none(r) for r in of]
     unknown = [r.answer['verdict'] == 'unknown_effect' for r in of]
-    some = [i for i, r in enumerate(of) if r.wrong]
-    named = [any(a for a, _ in reported[i]) for i in some]
-    sheet.rate('hand: mistake named', [of[i] for i in some], named, THRESHOLDS['mistake_named'], 1.0, True)
-    each = [b for i in some for _, b in reported[i]]
+    mistaken = [i for i, r in enumerate(of) if r.wrong]
+    named = [any(a for a, _ in reported[i]) for i in mistaken]
+    sheet.rate('hand: mistake named', [of[i] for i in mistaken], named, THRESHOLDS['mistake_named'], 1.0, True)
+    each = [b for i in mistaken for _, b in reported[i]]
     sheet.rate('hand: note with the right line', [], each, THRESHOLDS['hand_line'], 1.0, False)
     hidden = [i for i, r in enumerate(of) if r.truth]
-    right = [found[i] for i in hidden]
+    right = [named_all[i] for i in hidden]
     sheet.rate('hand: effect named', [of[i] for i in hidden], right, THRESHOLDS['hand_effect'], 1.0, True)
     sheet.rate('hand: an effect named that is none', of, false, 0.0, 0.0, False)
     sheet.rate('hand: something unknown, nothing is', of, unknown, 0.0, 0.0, False)
@@ -317,7 +317,7 @@ def _names_none(r: Row) -> bool:
 
 def _both(row: Row) -> bool:
     a, b = (t['name'] for t in row.truth)
-    return any(a in one and b in other for one, other in itertools.permutations(row.sets, 2))
+    return any(a in first and b in other for first, other in itertools.permutations(row.sets, 2))
 
 
 def _row_words(row: Row) -> str:

@@ -75,9 +75,9 @@ def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
     acting = np.zeros((n, 3))
     acting[held:] = load
     if kind == 'slip':
-        axis, turn = int(rng.integers(3)), float(rng.choice((-1.0, 1.0)))
+        axis, sign = int(rng.integers(3)), float(rng.choice((-1.0, 1.0)))
         # The load that moves the tip as far as the clamp does.
-        acting[event:, axis] += turn * SLIP * (3.0 * EI / LENGTH**2 if axis < 2 else GJ / LENGTH)
+        acting[event:, axis] += sign * SLIP * (3.0 * EI / LENGTH**2 if axis < 2 else GJ / LENGTH)
     volts = Generator(acting, np.full(n, 20.0), LENGTH).clean([])
     psd = int(rng.integers(2))
     if kind == 'bump':
@@ -122,7 +122,7 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
     noise = FITTED * SIGMA * MM_PER_V / math.sqrt(BLOCK)
     variances = np.full(4, noise**2)
     covariance = tuple((noise**2 * np.eye(3)).ravel().tolist())
-    turns = rng.uniform(0.0, 2.0 * math.pi, 4)
+    phases = rng.uniform(0.0, 2.0 * math.pi, 4)
     hold = HOLD_S * RATE // BLOCK
     message: list[str] = []
     at, seconds = 0, 0.0
@@ -130,7 +130,7 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
     while at * BLOCK < hours * 3600 * RATE:
         # Each repetition begins with a link at rest, as it is half a minute after its last load.
         t = (at + np.arange(len(clean))) * BLOCK / RATE
-        drift = DRIFT * np.sin(2.0 * math.pi * t[:, None] / (3600.0 * DRIFT_HOURS) + turns)
+        drift = DRIFT * np.sin(2.0 * math.pi * t[:, None] / (3600.0 * DRIFT_HOURS) + phases)
         dots = clean + drift + noise * rng.standard_normal(clean.shape)
         poses = solver.solve_many(dots, variances).pose
         late = {i * hold + int(rng.integers(2 * RATE // BLOCK)): LEVELS[i % len(LEVELS)] for i in range(HOLDS)}

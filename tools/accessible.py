@@ -45,8 +45,8 @@ def violations(driver: Any) -> list[str]:
     """What axe has against the page that ``driver`` shows: rule, and the elements concerned."""
     driver.set_script_timeout(WAIT_S)
     driver.execute_script(axe_source())
-    found = driver.execute_async_script(RUN)
-    return [f'{rule} ({text}): {where}: {" ".join(why.split())}' for rule, text, nodes in found for where, why in nodes]
+    rows = driver.execute_async_script(RUN)
+    return [f'{rule} ({text}): {where}: {" ".join(why.split())}' for rule, text, nodes in rows for where, why in nodes]
 
 
 def views(driver: Any) -> Iterator[str]:

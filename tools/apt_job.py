@@ -118,7 +118,7 @@ def main(argv: list[str] | None = None) -> int:
             if why:
                 lines[i] = ':'
                 reported.append(f'{"":14}cannot run here: {line.strip()}: {why}')
-        text = re.sub(r'\$\{\{ matrix\.(\w+) \}\}', lambda found: str(row[found[1]]), '\n'.join(lines))
+        text = re.sub(r'\$\{\{ matrix\.(\w+) \}\}', lambda match: str(row[match[1]]), '\n'.join(lines))
         (chroot / 'root/step.sh').write_text(text)
         begun, log = time.monotonic(), chroot / f'root/{step["name"].split()[0]}.log'
         shell = f'cd /root/ws && exec env {words} bash --noprofile --norc -eo pipefail /root/step.sh'

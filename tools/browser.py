@@ -33,10 +33,10 @@ def find_browser() -> tuple[str, str] | None:
 
 def open_browser(profile: Path, *flags: str) -> webdriver.Chrome:
     """A browser with an empty page, whose console is logged; its profile is a new folder. SystemExit without one."""
-    found = find_browser()
-    if found is None:
+    paths = find_browser()
+    if paths is None:
         raise SystemExit(WHAT_IS_NEEDED)
-    chromium, driver = found
+    chromium, driver = paths
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
     for flag in (*FLAGS, f'--user-data-dir={profile}', *flags):

@@ -34,14 +34,14 @@ def dialogue(port: str) -> tuple[int, float]:
     decoder = protocol.FrameDecoder()
     bad = 0
 
-    def until(kind: type[protocol.Frame], kept: list[protocol.Frame] | None = None) -> protocol.Frame:
+    def until(kind: type[protocol.Frame], record: list[protocol.Frame] | None = None) -> protocol.Frame:
         nonlocal bad
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             frames = decoder.feed(line.read(0.1))
             bad += sum(isinstance(f, protocol.BadFrame) for f in frames)
-            if kept is not None:
-                kept += frames
+            if record is not None:
+                record += frames
             for frame in frames:
                 if isinstance(frame, kind):
                     return frame

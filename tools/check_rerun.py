@@ -114,10 +114,10 @@ def check_picture(path: Path) -> None:
     """Check that every trace is visible on the left, and the dots and beams at the top right."""
     pixels = np.asarray(Image.open(path).convert('RGB'), np.int64)
     height, width = pixels.shape[:2]
-    left, above = pixels[:, : width // 2], pixels[: height // 3, width // 2 :]
-    for name, part, color in (*((p[1], left, p[4]) for p in POSE), ('the light', above, LIGHT)):
-        found = int((np.abs(part - np.array(color)).max(axis=-1) <= 24).sum())
-        need(found >= SHARE * part[..., 0].size, f'{path}: {found} pixels of {name}: nothing is shown')
+    left_half, above = pixels[:, : width // 2], pixels[: height // 3, width // 2 :]
+    for name, part, color in (*((p[1], left_half, p[4]) for p in POSE), ('the light', above, LIGHT)):
+        count = int((np.abs(part - np.array(color)).max(axis=-1) <= 24).sum())
+        need(count >= SHARE * part[..., 0].size, f'{path}: {count} pixels of {name}: nothing is shown')
 
 
 def main() -> int:

@@ -125,11 +125,11 @@ def _compile(work: Path, package: str) -> Path:
     flags = ['-O0', '-fPIC', *(f'-I{path}' for path in include)]
     files = [(kind, file) for kind in KINDS for file in (work / kind).rglob('*.c*')]
 
-    def one(file: Path) -> None:
+    def compile_file(file: Path) -> None:
         _run('gcc' if file.suffix == '.c' else 'g++', '-c', *flags, str(file), '-o', f'{file}.o')
 
     with ThreadPoolExecutor(2) as two:
-        list(two.map(one, (file for _, file in files)))
+        list(two.map(compile_file, (file for _, file in files)))
     # A library is found by its name once it is loaded: the last one loads all of them.
     names = {kind: f'lib{package}__{kind}.so' for kind in KINDS[:-1]}
     names[KINDS[-1]] = f'{package}_s__rosidl_typesupport_c{sysconfig.get_config_var("EXT_SUFFIX")}'

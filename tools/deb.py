@@ -56,10 +56,10 @@ LEFT = (
 
 def one_line(root: Path) -> str:
     """The line of README.md that goes from a checkout to the live page by pip."""
-    found = re.search(r'^python3 -m venv .+ monitor$', (root / 'README.md').read_text(), re.M)
-    if found is None:
+    match = re.search(r'^python3 -m venv .+ monitor$', (root / 'README.md').read_text(), re.M)
+    if match is None:
         raise ValueError('README.md: no line `python3 -m venv ... monitor`')
-    return found[0]
+    return match[0]
 
 
 def tree(root: Path, folder: Path) -> Path:

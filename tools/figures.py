@@ -71,9 +71,9 @@ def switched(target: str) -> None:
         (above, run.velocity[:, 0], [m.vx for m in moved], [m.velocity_covariance[0] for m in moved], 'mm/s'),
         (below, run.pose[:, 0], [m.dx for m in moved], [m.covariance[0] for m in moved], 'mm'),
     )
-    for axes, truth, found, variance, label in rows:
+    for axes, truth, filtered, variance, label in rows:
         axes.plot(t, truth * 1e3, color='0.4', linewidth=1.0, label='truth')
-        axes.errorbar(at, np.array(found) * 1e3, 3e3 * np.sqrt(variance), fmt='.', capsize=2, label='filter, ±3 sd')
+        axes.errorbar(at, np.array(filtered) * 1e3, 3e3 * np.sqrt(variance), fmt='.', capsize=2, label='filter, ±3 sd')
         axes.axvspan(*DARK, color='0.92', label='laser 2 off')
         axes.set(ylabel=f'ΔX ({label})', xlim=(3.05, END))
         axes.grid(alpha=0.3)

@@ -176,7 +176,7 @@ def answered(case: Case, folder: Path) -> str:
     study = STUDIES[case.study]
     names = {'REC': str(path), 'OUT': str(folder / 'out')}
     answer = run([names.get(word, word) for word in study.command.split()])
-    lines = [line.strip() for found in re.findall(study.message, answer, re.M) for line in found.splitlines()]
+    lines = [line.strip() for text in re.findall(study.message, answer, re.M) for line in text.splitlines()]
     return '\n'.join(without_repeats(lines)).replace(f'{folder}/', '')
 
 
@@ -224,11 +224,11 @@ def page(message: dict[str, str]) -> str:
     return '\n'.join(parts)
 
 
-def kept() -> dict[str, str]:
+def stored() -> dict[str, str]:
     if not PAGE.exists():
         return {}
-    found = re.findall(r'figures/gallery/(\w+)\.png\)\n\n((?: {4}.*\n)+)', PAGE.read_text())
-    return {name: '\n'.join(line[4:] for line in text.splitlines()) for name, text in found}
+    blocks = re.findall(r'figures/gallery/(\w+)\.png\)\n\n((?: {4}.*\n)+)', PAGE.read_text())
+    return {name: '\n'.join(line[4:] for line in text.splitlines()) for name, text in blocks}
 
 
 def same(now: str, before: str) -> bool:
@@ -237,18 +237,18 @@ def same(now: str, before: str) -> bool:
     if NUMBER.sub('#', now) != NUMBER.sub('#', before):
         return False
     for a, b in zip(NUMBER.finditer(now), NUMBER.finditer(before), strict=True):
-        one, other = (float(found[0].replace('−', '-')) for found in (a, b))
-        digit = max(_last_digit(found) for found in (a, b))
-        if abs(one - other) > 0.05 * max(abs(one), abs(other)) + 2.0 * digit:
+        x, y = (float(match[0].replace('−', '-')) for match in (a, b))
+        digit = max(_last_digit(match) for match in (a, b))
+        if abs(x - y) > 0.05 * max(abs(x), abs(y)) + 2.0 * digit:
             return False
     return True
 
 
-def _last_digit(found: re.Match[str]) -> float:
+def _last_digit(match: re.Match[str]) -> float:
     """What one in the last digit of a number is; 0 of a whole number."""
-    if found[1] is None and found[2] is None:
+    if match[1] is None and match[2] is None:
         return 0.0
-    return 10.0 ** (int(found[2] or 0) - len(found[1] or ''))
+    return 10.0 ** (int(match[2] or 0) - len(match[1] or ''))
 
 
 def shown(case: Case, renew: bool) -> str:
@@ -267,15 +267,15 @@ def main() -> int:
     args = parser.parse_args()
     cases = [case for case in CASES if args.only is None or args.only in case.name]
     FIGURES.mkdir(exist_ok=True)
-    message, before = {}, kept()
+    message, before = {}, stored()
     answers = over(partial(shown, renew=not args.check), cases, args.jobs, 'cases')
     for case, answer in zip(cases, answers, strict=True):
         message[case.name] = answer
     differ = [name for name, answer in message.items() if not same(answer, before.get(name, ''))]
     if not args.check:
-        PAGE.write_text(page(kept() | message))
-        for left in set(FIGURES.glob('*.png')) - {FIGURES / f'{case.name}.png' for case in CASES}:
-            left.unlink()
+        PAGE.write_text(page(stored() | message))
+        for unused in set(FIGURES.glob('*.png')) - {FIGURES / f'{case.name}.png' for case in CASES}:
+            unused.unlink()
     text = '\n\n'.join(f'{name}\n{message[name]}' for name in differ)
     return conclude(text or 'every case says what the page has', met=not (args.check and differ))
 

@@ -150,16 +150,16 @@ def tried(
     noticed = dict(line.split(' ') for line in lines)
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_checkout(Path(scratch))
-        left: list[Mutant | HandMade] = [*(of_room(room) if seed is None else drawn(folder, room, count, seed))]
+        remaining: list[Mutant | HandMade] = [*(of_room(room) if seed is None else drawn(folder, room, count, seed))]
         stages = [
             (stage, tests)
             for stage, tests in zip(STAGES, (room.tests, room.slow if slow else ()), strict=True)
             if tests
         ]
         for stage, tests in stages:
-            if not left:
+            if not remaining:
                 break
-            left, these = [], left
+            remaining, these = [], remaining
             with warm(python, folder, TIER_OF[stage], tests) as passed:
                 for mutant in these:
                     file = folder / mutant.file
@@ -179,7 +179,7 @@ def tried(
                     if observed or stage == stages[-1][0]:
                         yield f'{words}  (line {line})', observed
                     else:
-                        left.append(mutant)
+                        remaining.append(mutant)
 
 
 def equivalent() -> dict[str, str]:
@@ -212,7 +212,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     unnoticed: list[str] = []
     for name in arguments.rooms:
-        same, left, noticed = 0, 0, dict.fromkeys(STAGES, 0)
+        same, survived, noticed = 0, 0, dict.fromkeys(STAGES, 0)
         seed = None if arguments.by_hand else arguments.seed
         for words, observed in tried(name, arguments.python, arguments.count, seed, known, not arguments.quick):
             print(f'{observed or "NOT noticed"}: {words}', file=sys.stderr, flush=True)
@@ -221,12 +221,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             elif words.rpartition('  (')[0] in known:
                 same += 1
             else:
-                left += 1
+                survived += 1
                 unnoticed.append(words)
         quick, slow = noticed.values()
-        share = (quick + slow) / max(quick + slow + left, 1)
+        share = (quick + slow) / max(quick + slow + survived, 1)
         good &= share >= 0.95
-        print(f'| {name} | {same + quick + slow + left} | {same} | {quick} | {slow} | {share:.0%} |', flush=True)
+        print(f'| {name} | {same + quick + slow + survived} | {same} | {quick} | {slow} | {share:.0%} |', flush=True)
     for words in unnoticed:
         print(f'\nnot noticed: {words}')
     return 0 if good else 1

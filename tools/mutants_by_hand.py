@@ -30,10 +30,10 @@ class HandMade(NamedTuple):
 
     def line_of(self, text: str) -> int:
         """Where the line is, from 1. Raises ValueError as :meth:`code`."""
-        found = [number for number, line in enumerate(text.splitlines(), 1) if line.strip() == self.was]
-        if len(found) != 1:
-            raise ValueError(f'{BY_HAND.name}: {self.file} has this line {len(found)} times, not once: {self.was}')
-        return found[0]
+        numbers = [number for number, line in enumerate(text.splitlines(), 1) if line.strip() == self.was]
+        if len(numbers) != 1:
+            raise ValueError(f'{BY_HAND.name}: {self.file} has this line {len(numbers)} times, not once: {self.was}')
+        return numbers[0]
 
     def words(self, text: str) -> str:
         """For the list, as :meth:`Mutant.words`."""

@@ -49,8 +49,8 @@ def files_of(room: str) -> set[Path]:
     """The files of a room and of its tests, below the root."""
     words, names = ROOMS[room]
     names += ''.join(f' {OF_COMMAND.format(word)}' for word in words.split(', ') if word and ' ' not in word)
-    found = [path for name in names.split() for top in ('psd_deflection', 'test') for path in (ROOT / top).glob(name)]
-    files = {file.resolve() for path in found for file in (path, *path.rglob('*')) if file.suffix != '.pyc'}
+    paths = [path for name in names.split() for top in ('psd_deflection', 'test') for path in (ROOT / top).glob(name)]
+    files = {file.resolve() for path in paths for file in (path, *path.rglob('*')) if file.suffix != '.pyc'}
     return {file.relative_to(ROOT) for file in files if file.is_file()}
 
 

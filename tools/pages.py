@@ -46,8 +46,8 @@ def parameters() -> str:
     rows = []
     for section in SECTIONS:
         if not re.match(r'(psd|beam)_[2-9]', section.prefix):
-            found = (_named(p, len(section.prefix)) for p in section.parameters.values())
-            rows.append(f'| {section.prefix.replace("_1", "_N") or "none"} | {", ".join(found)} |')
+            cells = (_named(p, len(section.prefix)) for p in section.parameters.values())
+            rows.append(f'| {section.prefix.replace("_1", "_N") or "none"} | {", ".join(cells)} |')
     return _table('prefix | parameters', rows)
 
 
@@ -108,8 +108,8 @@ def written(page: str) -> str:
     """Return the text of ``page`` with the current tables."""
     for name, table in TABLES.items():
         begin, end = f'<!-- {name}: python -m tools.pages writes this table -->', f'<!-- end of {name} -->'
-        before, found, rest = page.partition(begin)
-        if found:
+        before, marker, rest = page.partition(begin)
+        if marker:
             page = f'{before}{begin}\n\n{table()}\n\n{end}{rest.partition(end)[2]}'
     return page
 

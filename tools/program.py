@@ -108,17 +108,17 @@ class Program:
 
     def until(self, pattern: str) -> re.Match[str]:
         """Wait for the first match in a line. RuntimeError if the program ends or the time runs out first."""
-        found: list[re.Match[str]] = []
+        matches: list[re.Match[str]] = []
 
         def look() -> bool:
-            found.extend(match for line in self.lines if (match := re.search(pattern, line)))
-            return bool(found) or self._ended
+            matches.extend(match for line in self.lines if (match := re.search(pattern, line)))
+            return bool(matches) or self._ended
 
         with self._new:
             self._new.wait_for(look, self._wait_s)
-        if not found:
+        if not matches:
             raise RuntimeError(f'{pattern!r} was not said, but:\n{self.text[-4000:]}')
-        return found[0]
+        return matches[0]
 
     def send(self, number: int) -> None:
         """Send a signal to the program and its children; does nothing if they have ended."""

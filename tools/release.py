@@ -185,11 +185,11 @@ def check_rosdep(root: Path, release: bool) -> Iterator[str]:
     for element in xml.etree.ElementTree.parse(root / 'package.xml').getroot():
         if not element.tag.endswith('depend'):
             continue
-        found = table.get(element.text or '')
-        if found is None:
+        row = table.get(element.text or '')
+        if row is None:
             yield f'package.xml: key {element.text} is not in packaging/rosdep_keys.csv'
             continue
-        for system, how in found.items():
+        for system, how in row.items():
             if how == 'pip':
                 yield f'package.xml: key {element.text} is resolved by pip on {system}; bloom rejects it'
             elif how != 'apt' and release:
@@ -267,10 +267,10 @@ def _tool(command: list[str | Path], cwd: Path) -> tuple[int, str]:
 def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[list[str], list[str]]:
     """(problems, what was not tried) of the sdist, the wheel and the environment with all extras."""
     problems: list[str] = []
-    left: list[str] = []
+    untested: list[str] = []
     wheels, sdists = sorted(dist.glob('*.whl')), sorted(dist.glob('*.tar.gz'))
     if len(wheels) != 1 or len(sdists) != 1:
-        return [f'{dist}: {len(wheels)} wheels and {len(sdists)} sdists, one of each is due'], left
+        return [f'{dist}: {len(wheels)} wheels and {len(sdists)} sdists, one of each is due'], untested
     problems += check_wheel(root, wheels[0])
     checks: tuple[tuple[str, list[str | Path]], ...] = (
         ('twine', ['check', '--strict', wheels[0], sdists[0]]),
@@ -285,10 +285,10 @@ def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[l
         if status:
             problems.append(f'{name}: {message}')
     python = installed / 'bin/python'
-    found, silent = check_licences_of(python)
-    problems += found
+    unlicensed, silent = check_licences_of(python)
+    problems += unlicensed
     if silent:
-        left.append('licences that no metadata states: ' + ', '.join(silent))
+        untested.append('licences that no metadata states: ' + ', '.join(silent))
     bom = dist.parent / 'build/release/sbom.cdx.json'
     status, message = _tool([tools / 'bin/cyclonedx-py', 'environment', python, '--of', 'JSON', '-o', bom], root)
     if status or not json.loads(bom.read_text()).get('components'):
@@ -298,8 +298,8 @@ def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[l
     if 'Found' in message and 'vulnerabilit' in message:
         problems.append(f'pip-audit: {message}')
     elif status or 'Skip Reason' in message:
-        left.append('pip-audit: not every package was found in its database: ' + message.splitlines()[-1])
-    return problems, left
+        untested.append('pip-audit: not every package was found in its database: ' + message.splitlines()[-1])
+    return problems, untested
 
 
 def _site(python: Path) -> str:
@@ -329,15 +329,17 @@ def main(argv: list[str] | None = None, root: Path = ROOT) -> int:
         return 0
     release = os.environ.get('RELEASE') == '1'
     problems = [problem for check in TREE for problem in check(root, release)]
-    left: list[str] = []
+    untested: list[str] = []
     if options.installed and options.tools:
-        found, left = check_built(root, options.dist.resolve(), options.installed.absolute(), options.tools.absolute())
-        problems += found
+        lacks, untested = check_built(
+            root, options.dist.resolve(), options.installed.absolute(), options.tools.absolute()
+        )
+        problems += lacks
     else:
-        left = ['what is built: --installed and --tools name where it is']
+        untested = ['what is built: --installed and --tools name where it is']
     if not release:
-        left.append('what only a release must have (real addresses, a date, rows of rosdep): RELEASE=1')
-    for line in (*left, *NEVER_HERE):
+        untested.append('what only a release must have (real addresses, a date, rows of rosdep): RELEASE=1')
+    for line in (*untested, *NEVER_HERE):
         print(f'not tried: {line}')
     for line in problems:
         print(f'PROBLEM: {line}')

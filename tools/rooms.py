@@ -28,8 +28,8 @@ def lines_of(folder: Path) -> list[int]:
 
 def private_names(folder: Path) -> list[str]:
     """The uses of private names in the files below ``folder``, as ``name._private``."""
-    found = (n for path in folder.rglob('*.py') for n in re.findall(r'[a-z_]+\._[a-z]\w+', path.read_text('utf-8')))
-    of_others = [name for name in found if not name.startswith(('self.', 'cls.'))]
+    names = (n for path in folder.rglob('*.py') for n in re.findall(r'[a-z_]+\._[a-z]\w+', path.read_text('utf-8')))
+    of_others = [name for name in names if not name.startswith(('self.', 'cls.'))]
     return [name for name in of_others if name.rpartition('.')[2] not in DOCUMENTED]
 
 

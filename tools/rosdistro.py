@@ -45,10 +45,10 @@ print(json.dumps(found))
 
 def our_rows(root: Path) -> str:
     """The lines to submit, of packaging/rosdistro.md."""
-    found = re.search(r'^```yaml\n(.+?)^```', (root / 'packaging/rosdistro.md').read_text(), re.M | re.S)
-    if found is None:
+    match = re.search(r'^```yaml\n(.+?)^```', (root / 'packaging/rosdistro.md').read_text(), re.M | re.S)
+    if match is None:
         raise ValueError('packaging/rosdistro.md: no block of yaml')
-    return found[1]
+    return match[1]
 
 
 def written(rosdistro: Path, into: Path, ours: str = '', root: Path = Path('/')) -> dict[str, str]:
@@ -104,13 +104,13 @@ def resolved(env: dict[str, str], tools: Path, keys: list[str]) -> dict[str, dic
     return rows
 
 
-def differences(table: dict[str, dict[str, str]], found: dict[str, dict[str, str]]) -> list[str]:
+def differences(table: dict[str, dict[str, str]], rosdep: dict[str, dict[str, str]]) -> list[str]:
     """Where the table says otherwise than rosdep."""
     return [
-        f'packaging/rosdep_keys.csv: {key} on {version} is {message}, rosdep says {found[key][version]}'
+        f'packaging/rosdep_keys.csv: {key} on {version} is {message}, rosdep says {rosdep[key][version]}'
         for key, row in table.items()
         for version, message in row.items()
-        if found[key][version] != message
+        if rosdep[key][version] != message
     ]
 
 
@@ -126,15 +126,17 @@ def main(argv: list[str] | None = None) -> int:
     for ours in ('', our_rows(ROOT)):
         with tempfile.TemporaryDirectory() as folder:
             env = prepared(options.rosdistro, options.tools, Path(folder), ours)
-            found = resolved(env, options.tools, list(dict.fromkeys([*table, *needed])))
+            rosdep = resolved(env, options.tools, list(dict.fromkeys([*table, *needed])))
         if not ours:
-            problems += differences(table, found)
-            none = sorted({key for key in needed if 'none' in found[key].values()})
+            problems += differences(table, rosdep)
+            none = sorted({key for key in needed if 'none' in rosdep[key].values()})
             print(f'{len(needed)} keys of package.xml; without a row somewhere: {", ".join(none) or "none"}')
         else:
-            left = [f'{key} on {v}: {how}' for key in needed for v, how in found[key].items() if how != 'apt']
-            problems += [f'with packaging/rosdistro.md: {line}' for line in left]
-            print(f'with the lines of packaging/rosdistro.md: {len(left)} of {len(needed)} keys do not resolve by apt')
+            missing = [f'{key} on {v}: {how}' for key in needed for v, how in rosdep[key].items() if how != 'apt']
+            problems += [f'with packaging/rosdistro.md: {line}' for line in missing]
+            print(
+                f'with the lines of packaging/rosdistro.md: {len(missing)} of {len(needed)} keys do not resolve by apt'
+            )
     for line in problems:
         print(f'PROBLEM: {line}')
     return 1 if problems else 0

@@ -161,15 +161,15 @@ def blocks_to_run() -> list[list[Command]]:
         blocks.setdefault(command.block, []).append(command)
     out = []
     for block in blocks.values():
-        left = []
+        selected = []
         for c in block:
-            own = c.page in JOURNEYS or WRITES.search(c.line) or extras_of(c.page)
-            key = (c.page if own and not is_campaign(c.line) else '', typed_as(c.line))
+            once_a_page = c.page in JOURNEYS or WRITES.search(c.line) or extras_of(c.page)
+            key = (c.page if once_a_page and not is_campaign(c.line) else '', typed_as(c.line))
             if run_by_ci(c.line) is None and (key not in observed or c.page in JOURNEYS):
-                left.append(c)
+                selected.append(c)
                 observed.add(key)
-        if left:
-            out.append(left)
+        if selected:
+            out.append(selected)
     return out
 
 
@@ -182,9 +182,9 @@ def extras_of(page: str) -> list[str]:
     setup = configparser.ConfigParser()
     setup.read(ROOT / 'setup.cfg')
     wanted = []
-    for found in PIP.finditer((ROOT / page).read_text(encoding='utf-8')):
-        wanted += [found['package']] if found['package'] else []
-        for extra in set((found['extras'] or '').split(',')) - {*BASE, *TRIED_ALONE, ''}:
+    for match in PIP.finditer((ROOT / page).read_text(encoding='utf-8')):
+        wanted += [match['package']] if match['package'] else []
+        for extra in set((match['extras'] or '').split(',')) - {*BASE, *TRIED_ALONE, ''}:
             wanted += setup['options.extras_require'][extra].split()
     return sorted(set(wanted))
 
@@ -249,8 +249,8 @@ class CleanRoom:
         bare = {k: v for k, v in os.environ.items() if k not in ('MAKEFLAGS', 'WITH', 'VENV', 'VIRTUAL_ENV')}
         subprocess.run(['make', f'PYTHON={sys.executable}', '.venv/.installed'], cwd=folder, env=bare, check=True)
         self._base = self._installed()
-        kept = ('ROS_DOMAIN_ID', 'ROS_LOG_DIR', 'XDG_STATE_HOME', 'LANG', 'TERM', 'OMP_NUM_THREADS')
-        self._reader = {name: os.environ[name] for name in kept if name in os.environ}
+        inherited = ('ROS_DOMAIN_ID', 'ROS_LOG_DIR', 'XDG_STATE_HOME', 'LANG', 'TERM', 'OMP_NUM_THREADS')
+        self._reader = {name: os.environ[name] for name in inherited if name in os.environ}
         self._reader |= {'PATH': f'{self._venv}/bin:/usr/local/bin:/usr/bin:/bin', 'HOME': str(beside / 'home')}
         Path(self._reader['HOME']).mkdir()
 

@@ -52,8 +52,8 @@ def install(packages: Sequence[str], environment: str = sys.prefix) -> None:
     if not python.exists():
         subprocess.run([sys.executable, '-m', 'venv', environment], check=True)
     uv = shutil.which('uv')
-    by = [uv, 'pip', 'install', '--python', str(python)] if uv else [str(python), '-m', 'pip', 'install']
-    subprocess.run([*by, '--quiet', *packages], cwd=ROOT, check=True)
+    installer = [uv, 'pip', 'install', '--python', str(python)] if uv else [str(python), '-m', 'pip', 'install']
+    subprocess.run([*installer, '--quiet', *packages], cwd=ROOT, check=True)
 
 
 def bench(words: list[str]) -> int:

@@ -27,8 +27,8 @@ SIZE = (940, 1250)  # Of the picture.
 
 def state(driver: Any) -> str:
     """What the page says of itself: ready, absent, running, done or failed."""
-    found: str | None = driver.execute_script('return document.getElementById("try-form").dataset.state')
-    return found or ''
+    value: str | None = driver.execute_script('return document.getElementById("try-form").dataset.state')
+    return value or ''
 
 
 def text(driver: Any, name: str) -> str:

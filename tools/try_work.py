@@ -18,8 +18,8 @@ def run(effect: str, seed: int, notify: Callable[[str, str], None]) -> None:
     estimates = psd_deflection.replay(recording)
     reach = np.ptp(estimates.dy) * 1e6
     notify('step', f'Searching: {len(estimates.t)} estimates, the tip has moved by {reach:.0f} µm')
-    found = psd_deflection.discover([recording])
-    for sentence in found.sentences():
+    discovery = psd_deflection.discover([recording])
+    for sentence in discovery.sentences():
         notify('answer', sentence)
     notify('step', 'Drawing the report')
-    notify('report', found.report())
+    notify('report', discovery.report())

@@ -74,8 +74,8 @@ class Watch:
         sys.settrace(None)
         here = str(Path.cwd()) + os.sep
         out = {}
-        for name, own in self._tests.items():
-            codes = {**self._common, **self._fixtures[name.partition('::')[0]], **own}.values()
+        for name, entered in self._tests.items():
+            codes = {**self._common, **self._fixtures[name.partition('::')[0]], **entered}.values()
             ours = [c for c in codes if c.co_filename.startswith(here)]
             out[name] = self._seconds[name], [(c.co_filename.removeprefix(here), c.co_firstlineno) for c in ours]
         return json.dumps(out)
@@ -141,9 +141,9 @@ def known(tier: str, tests: Sequence[str]) -> dict[str, Test] | None:
 def chosen(tests: dict[str, Test], file: str, first: int) -> list[str]:
     """Those of ``tests`` that enter the function that begins in line ``first`` of ``file``, the quickest first. 0: all,
     those that enter a function of ``file`` first."""
-    near = {name: any(f == file for f, _ in test.entered) for name, test in tests.items()}
+    in_file = {name: any(f == file for f, _ in test.entered) for name, test in tests.items()}
     names = [name for name, test in tests.items() if first == 0 or (file, first) in test.entered]
-    names.sort(key=lambda name: (not near[name], tests[name].seconds))
+    names.sort(key=lambda name: (not in_file[name], tests[name].seconds))
     total = itertools.accumulate(tests[name].seconds for name in names)
     return [name for name, seconds in zip(names, total, strict=True) if seconds <= MOST]
 

@@ -25,7 +25,7 @@ SENTENCE = re.compile('test_[a-z0-9]+_[a-z0-9]+_[a-z0-9_]+')
 ROOMS = ('psd_deflection', 'msg_adapters', 'launch', 'test', 'bench', 'blind', 'tools', 'bags')
 
 
-def counted(text: str) -> Counter[str]:
+def uses_of(text: str) -> Counter[str]:
     """Return the uses of each finished word in the identifiers of Python source ``text``."""
     names = (t.string for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.NAME)
     parts = (
@@ -39,7 +39,7 @@ def counted(text: str) -> Counter[str]:
 
 if __name__ == '__main__':
     files = [path for room in ROOMS for path in Path(room).rglob('*.py')]
-    uses = {path: counted(path.read_text()) for path in files}
+    uses = {path: uses_of(path.read_text()) for path in files}
     for path, words in uses.items():
         for word, count in words.items():
             print(f'{path}: {word}: {count} uses, write {FINISHED[word]}')

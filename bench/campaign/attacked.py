@@ -158,10 +158,10 @@ class UnknownInputError(Exception):
 
 def good_of(topic: str, kind: type) -> Good:
     """What makes good messages of ``topic``. Raises UnknownInputError."""
-    found = [GOOD[end] for end in sorted(GOOD, key=len) if topic.endswith(end)]
-    if not found or type(found[-1]()) is not kind:
+    matches = [GOOD[end] for end in sorted(GOOD, key=len) if topic.endswith(end)]
+    if not matches or type(matches[-1]()) is not kind:
         raise UnknownInputError(f'{topic} ({kind.__name__}): is in no table of {__name__}: add a good message of it')
-    return found[-1]
+    return matches[-1]
 
 
 class Attacked(ABC):

@@ -49,7 +49,7 @@ def random_scene(rng: np.random.Generator) -> Any:
         centre=(rng.uniform(300.0, 340.0), rng.uniform(220.0, 260.0)),
         distortion=(lens, rng.uniform(-0.1, 0.1), *rng.uniform(-1e-3, 1e-3, 2)) if rng.random() < 0.7 else (),
         distance=rng.uniform(0.38, 0.6),
-        turn=rng.uniform(-0.6, 0.6),
+        roll=rng.uniform(-0.6, 0.6),
         tilt=tuple(rng.uniform(-0.3, 0.3, 2)),
         aim=tuple(rng.uniform(-0.012, 0.012, 2)),
         view='base' if rng.random() < 0.3 else 'outside',
@@ -102,10 +102,10 @@ def adverse(
         away = render.Pose(float(dx), float(dy), z=rng.uniform(-0.02, 0.02))
         if hurt == 'far away':
             away = render.Pose(z=(-1.0 if scene.view == 'outside' else 1.0) * rng.uniform(0.3, 6.0))
-        near = motion
+        base_motion = motion
 
         def motion(t: float) -> Any:
-            return replace(near(t), dx=near(t).dx + away.dx, dy=near(t).dy + away.dy, z=away.z)
+            return replace(base_motion(t), dx=base_motion(t).dx + away.dx, dy=base_motion(t).dy + away.dy, z=away.z)
 
     exposure = {'motion blur': rng.uniform(2e-3, 8e-3), 'long exposure': rng.uniform(8e-3, 33e-3)}.get(hurt, 3e-4)
     instants = 24 if exposure > 1e-3 else 2
@@ -125,12 +125,12 @@ def adverse(
     cx, cy = render.pixel_of(scene, poses[0], 0.0, scene.spacing * rng.integers(-1, 2))
     pixel = scene.focal / scene.distance
     r = scene.radius * pixel
-    turn = rng.uniform(0, 2 * np.pi)
-    at = (cx + r * math.cos(turn), cy + r * math.sin(turn))
+    angle = rng.uniform(0, 2 * np.pi)
+    at = (cx + r * math.cos(angle), cy + r * math.sin(angle))
     size = rng.uniform(0.05, 1.2) * r
     if hurt in {'occluder', 'occluder of its colour'}:
-        across = (u - at[0]) * math.cos(turn) + (v - at[1]) * math.sin(turn)
-        along = -(u - at[0]) * math.sin(turn) + (v - at[1]) * math.cos(turn)
+        across = (u - at[0]) * math.cos(angle) + (v - at[1]) * math.sin(angle)
+        along = -(u - at[0]) * math.sin(angle) + (v - at[1]) * math.cos(angle)
         cover = (np.abs(across) < size) & (np.abs(along) < size * rng.uniform(0.3, 3.0))
         edge = gaussian_filter(cover.astype(float), rng.uniform(0.3, 2.0))
         colour = rng.choice([scene.black, scene.white]) if 'colour' in hurt else rng.uniform(0, 255)
@@ -141,7 +141,7 @@ def adverse(
     if hurt == 'ghost':
         # Nearer than that, two pictures are a motion that was exposed twice, and their mean is right.
         apart = rng.uniform(4.0, 14.0)
-        shift = np.rint([apart * math.sin(turn), apart * math.cos(turn)]).astype(int)
+        shift = np.rint([apart * math.sin(angle), apart * math.cos(angle)]).astype(int)
         grey = grey + rng.uniform(0.1, 1.0) * (np.roll(grey, shift, (0, 1)) - scene.black)
     if hurt in {'over-exposed', 'blooming'}:
         grey = grey * rng.uniform(1.2, 6.0)
@@ -156,8 +156,8 @@ def adverse(
     if hurt == 'clutter':
         for _ in range(int(rng.integers(3, 25))):
             x, y, q = rng.uniform(0, columns), rng.uniform(0, rows), rng.uniform(3, 50)
-            near = np.hypot(u - x, (v - y) * rng.uniform(0.6, 1.6)) < q
-            grey = np.where(near, rng.uniform(0, 255), grey)
+            base_motion = np.hypot(u - x, (v - y) * rng.uniform(0.6, 1.6)) < q
+            grey = np.where(base_motion, rng.uniform(0, 255), grey)
     if hurt == 'lines of noise':
         grey = grey + rng.normal(0, rng.uniform(2, 15), (rows, 1))
     sd = np.sqrt(scene.read_noise**2 + scene.shot_noise**2 * np.maximum(grey, 0.0))
@@ -209,10 +209,10 @@ def adverse_table(frames: int, seed: int) -> bool:
     print('frame with               frames  rejected  worst/sd  rms/sd  sd um  reason')
     total = wrong = 0
     for hurt in HURTS:
-        found = np.array(sigmas.get(hurt, []))
-        count = len(found) + rejected[hurt]
-        total, wrong = total + count, wrong + int(np.sum(found > SIGMAS))
-        worst = f'{found.max():8.2f} {np.sqrt(np.mean(found**2)):7.2f}' if len(found) else f'{"":8} {"":7}'
+        errors = np.array(sigmas.get(hurt, []))
+        count = len(errors) + rejected[hurt]
+        total, wrong = total + count, wrong + int(np.sum(errors > SIGMAS))
+        worst = f'{errors.max():8.2f} {np.sqrt(np.mean(errors**2)):7.2f}' if len(errors) else f'{"":8} {"":7}'
         sd = f'{np.median(sds[hurt]):6.2f}' if hurt in sds else f'{"":6}'
         reason = ', '.join(f'{r} {n}' for r, n in reasons.get(hurt, Counter()).most_common(3))
         print(f'{hurt:24} {count:6} {100 * rejected[hurt] / max(count, 1):7.1f}%  {worst} {sd}  {reason}')
@@ -231,8 +231,8 @@ SCALES = {
 def bound_of(scene: render.Scene) -> float:
     """Cramer-Rao bound of the place of the middle disc in the image, px a coordinate: noise over the summed slopes."""
     shift = 0.05 * scene.distance / scene.focal
-    one = replace(scene, discs=1)
-    ends = [render.clean(one, [render.Pose(dx=s * shift)]) for s in (1.0, -1.0)]
+    single = replace(scene, discs=1)
+    ends = [render.clean(single, [render.Pose(dx=s * shift)]) for s in (1.0, -1.0)]
     slope = (ends[0] - ends[1]) / 0.1
     # Rounding to whole grey levels is noise too.
     return math.sqrt((scene.read_noise**2 + 1.0 / 12.0) / float(np.sum(slope**2)))
@@ -261,10 +261,10 @@ def accuracy_table(frames: int, seed: int) -> bool:
         scales = np.array([1e6, 1e6, math.degrees(1e3)])
         rms = np.sqrt(np.mean(np.square(off), axis=0)) * scales
         # The rest is a mean of eight frames.
-        (own,) = math.sqrt(1.0 + 1.0 / 8.0) * scales * pose_bounds(scene, discs_picture, slice(None))
+        (bounds,) = math.sqrt(1.0 + 1.0 / 8.0) * scales * pose_bounds(scene, discs_picture, slice(None))
         centre, bound = float(np.sqrt(np.mean(np.square(centres)))), bound_of(scene)
         print(f'{name:12} {frames:6}  {centre:9.4f}  {bound:8.4f}', end='')
-        for value, least, share in zip(rms, own, np.mean(inside, axis=0), strict=True):
+        for value, least, share in zip(rms, bounds, np.mean(inside, axis=0), strict=True):
             print(f'    {value:6.3f} {least:6.3f}  {share:7.3f}', end='')
         print()
         fine &= centre < 0.03 and centre < 1.5 * bound and max(rms[0], rms[1]) < 10.0 and rms[2] < 30.0
@@ -274,8 +274,8 @@ def accuracy_table(frames: int, seed: int) -> bool:
 BOARD_THETA = 0.003  # Largest rms error of theta by a board, degrees: a tenth of what is asked of the discs.
 
 VIEWS = {
-    '640 x 480': render.Scene(focal=1700.0, turn=0.02),
-    '1920 x 1080': render.Scene(width=1920, height=1080, focal=4200.0, centre=(960.0, 520.0), blur=1.0, turn=0.02),
+    '640 x 480': render.Scene(focal=1700.0, roll=0.02),
+    '1920 x 1080': render.Scene(width=1920, height=1080, focal=4200.0, centre=(960.0, 520.0), blur=1.0, roll=0.02),
 }
 """Both targets seen by the same camera from the same place; a board of 70 x 90 mm fills most of the height."""
 
@@ -307,13 +307,13 @@ def pose_bounds(scene: render.Scene, picture: Any, *nears: Any) -> Any:
     """Cramer-Rao bounds (masks, 3) of dX m, dY m, theta rad of one frame, with all six of the pose unknown. From the
     pixels of each mask."""
     shift = 0.25 * scene.distance / scene.focal
-    turn = shift / 0.03
+    rotation = shift / 0.03
     slopes = []
-    for name, step in (('dx', shift), ('dy', shift), ('theta', turn), ('phi', 0.02), ('omega', 0.02), ('z', 2e-3)):
+    for name, step in (('dx', shift), ('dy', shift), ('theta', rotation), ('phi', 0.02), ('omega', 0.02), ('z', 2e-3)):
         ends = [picture(scene, replace(render.Pose(), **{name: sign * step})) for sign in (1.0, -1.0)]
         slopes.append((ends[0] - ends[1]) / (2.0 * step))
     variance = scene.read_noise**2 + 1.0 / 12.0
-    rows = [np.array([slope[near].ravel() for slope in slopes]) for near in nears]
+    rows = [np.array([slope[mask].ravel() for slope in slopes]) for mask in nears]
     return np.array([np.sqrt(np.diag(np.linalg.inv(r @ r.T / variance))[:3]) for r in rows])
 
 
@@ -324,10 +324,10 @@ def near_corners(scene: render.Scene, settings: CameraSettings) -> Any:
     at = render.pixels_of(scene, render.Pose(), np.array([[x, y] for x in across for y in up]))
     reach = min(7.0, 0.5 * (settings.square - settings.marker) * scene.focal / scene.distance)
     v, u = np.mgrid[: scene.height, : scene.width]
-    near = np.zeros(v.shape, dtype=bool)
+    mask = np.zeros(v.shape, dtype=bool)
     for x, y in at:
-        near |= np.hypot(u - x, v - y) < reach
-    return near
+        mask |= np.hypot(u - x, v - y) < reach
+    return mask
 
 
 def theta_error(scene: render.Scene, settings: CameraSettings, picture: Any, frames: int, seed: int) -> float:
@@ -360,8 +360,8 @@ def boards_table(frames: int, seed: int, *, short: bool = False) -> bool:
             disc = theta_error(scene, discs, discs_picture, frames, seed)
             (of_disc,) = np.degrees(pose_bounds(scene, discs_picture, everywhere)[:, 2])
             corner = theta_error(scene, board, picture, frames, seed)
-            near = near_corners(scene, board)
-            of_corners, of_all = np.degrees(pose_bounds(scene, picture, near, everywhere)[:, 2])
+            mask = near_corners(scene, board)
+            of_corners, of_all = np.degrees(pose_bounds(scene, picture, mask, everywhere)[:, 2])
             print(
                 f'{name:12} {tilt:4.0f}   {disc:.5f}  {of_disc:.5f}    {corner:.5f}  {of_corners:.5f}    {of_all:.5f} '
                 f'{disc / corner:9.1f}  {of_disc / of_corners:6.1f}  {of_disc / of_all:9.1f}'

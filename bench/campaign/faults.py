@@ -190,10 +190,10 @@ def _wrong_baud(line: Line, pid: int) -> None:
 
 
 def _duplicates(line: Line, pid: int) -> None:
-    kept: list[bytes] = []
+    frames: list[bytes] = []
     # append() returns None: the frames go on as they are.
-    _changed(lambda line, frame: kept.append(frame), 0.03)(line, pid)
-    line.inject(b''.join(kept[-30:]))
+    _changed(lambda line, frame: frames.append(frame), 0.03)(line, pid)
+    line.inject(b''.join(frames[-30:]))
     pause(0.02)
 
 

@@ -451,13 +451,13 @@ def main() -> int:
     corpus = Path(tempfile.mkdtemp())
     for i, seed in enumerate(seeds):
         (corpus / f'seed_{i}').write_bytes(seed)
-    found = ROOT / 'build' / 'fuzz'
-    found.mkdir(parents=True, exist_ok=True)
+    crashes = ROOT / 'build' / 'fuzz'
+    crashes.mkdir(parents=True, exist_ok=True)
 
     def one_input(content: bytes) -> None:
         evaluated(target, content)
 
-    atheris.Setup([sys.argv[0], str(corpus), *LIMITS, f'-artifact_prefix={found}/{name}_', *sys.argv[2:]], one_input)
+    atheris.Setup([sys.argv[0], str(corpus), *LIMITS, f'-artifact_prefix={crashes}/{name}_', *sys.argv[2:]], one_input)
     atheris.Fuzz()
     return 0
 

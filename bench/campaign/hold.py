@@ -224,8 +224,8 @@ class Campaign(Graph):
         return float(stamps[after][moved][0]) if moved.any() else math.inf
 
     def close(self) -> None:
-        for one in self.relays.values():
-            one.close()
+        for relay in self.relays.values():
+            relay.close()
         super().close()
 
 
@@ -380,17 +380,17 @@ def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
         campaign.enable()
         for name in names:
             heard, campaign.repeated = len(campaign.plant.offsets), 0
-            found = [campaign.inject(name) for _ in range(times)]
-            held = [one.held for one in found if not math.isnan(one.held)]
-            released = [one for one in found if not math.isnan(one.released)]
+            reactions = [campaign.inject(name) for _ in range(times)]
+            held = [r.held for r in reactions if not math.isnan(r.held)]
+            released = [r for r in reactions if not math.isnan(r.released)]
             late += sum(t > HOLD_S for t in held)
-            slow += sum(one.released > one.allowed for one in released)
+            slow += sum(r.released > r.allowed for r in released)
             step = campaign.plant.step(heard - 1)
             worst = max(worst, step)
             print(
-                f'{name:24}{len(found):4} times (and {campaign.repeated} repeated): held after {_most(held)}; '
-                f'released in {_most([one.released for one in released])} '
-                f'of {_most([one.allowed for one in released])}; largest step {step:.3f} of max_rate * dt',
+                f'{name:24}{len(reactions):4} times (and {campaign.repeated} repeated): held after {_most(held)}; '
+                f'released in {_most([r.released for r in released])} '
+                f'of {_most([r.allowed for r in released])}; largest step {step:.3f} of max_rate * dt',
                 flush=True,
             )
     finally:

@@ -167,8 +167,8 @@ class Line:
             time.sleep(0.002)
 
     def _serve(self) -> None:
-        due = int((time.monotonic() - self._start) * RATE) - self.sent
-        for _ in range(due):
+        n_due = int((time.monotonic() - self._start) * RATE) - self.sent
+        for _ in range(n_due):
             self._sample()
         terminal = self._terminal
         if terminal is None:

@@ -64,22 +64,22 @@ class Inside:
 
     def inputs(self) -> dict[str, list[Any]]:
         out: dict[str, list[Any]] = {}
-        for one in self._node.subscriptions:
-            out.setdefault(one.topic_name, []).append(one)
+        for subscription in self._node.subscriptions:
+            out.setdefault(subscription.topic_name, []).append(subscription)
         return out
 
     def hand(self, topic: str, content: bytes) -> None:
-        for one in self.inputs().get(topic, ()):
-            if one.raw:
+        for subscription in self.inputs().get(topic, ()):
+            if subscription.raw:
                 message = content
             else:
                 try:
-                    message = deserialize_message(content, one.msg_type)
+                    message = deserialize_message(content, subscription.msg_type)
                 except (RuntimeError, UnicodeDecodeError):
                     # DDS does not hand over what it cannot decode.
                     continue
             try:
-                one.callback(message)
+                subscription.callback(message)
             except BaseException as error:
                 raise EndedError(f'{topic}: {type(error).__name__}: {error}: {content[:3000].hex()}') from error
 
@@ -219,7 +219,7 @@ def main() -> int:
     same = [f'--minutes={args.minutes}', f'--seed={args.seed}']
     command = [sys.executable, '-m', 'bench.campaign.messages', *same]
     each = [subprocess.Popen([*command, '--node', name], cwd=ROOT) for name in NODES]
-    return max(abs(one.wait()) for one in each)
+    return max(abs(process.wait()) for process in each)
 
 
 if __name__ == '__main__':

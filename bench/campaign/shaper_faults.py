@@ -156,7 +156,7 @@ class Moved(Spun):
         self.spin(1.5)
 
 
-def injected(moved: Moved, names: Sequence[str], times: int, by: str = 'shaper') -> float:
+def injected(moved: Moved, names: Sequence[str], times: int, label: str = 'shaper') -> float:
     """Inject each of them so often, and print a line for each; the largest step over what is allowed."""
     worst = 0.0
     try:
@@ -168,7 +168,7 @@ def injected(moved: Moved, names: Sequence[str], times: int, by: str = 'shaper')
             step = largest_step_in_time(moved.stamps[since:], moved.commands[since:], FASTEST, numbers)
             worst = max(worst, step)
             came = f', {len(numbers)} came too late' if numbers else ''
-            print(f'{by}: {name:26}{times:4} times: largest step {step:.3f} of speed * dt{came}', flush=True)
+            print(f'{label}: {name:26}{times:4} times: largest step {step:.3f} of speed * dt{came}', flush=True)
     finally:
         moved.close()
     return worst

@@ -158,11 +158,11 @@ def real_time(minutes: float) -> bool:
         # Recorded times are ROS times; the offset to CLOCK_MONOTONIC is one constant of the run.
         offset = time.time_ns() - time.monotonic_ns()
         truth = np.array([device.true_ns(int(n)) for n in numbers]) + offset
-        settled = stamps - stamps[0] > SETTLED_S * 10**9
+        steady = stamps - stamps[0] > SETTLED_S * 10**9
         growth = memory[-1][1] - memory[0][1] if memory else 0
         print(f'{minutes:g} minutes: {len(numbers)} samples recorded, {poses[0]} poses received by a subscriber')
         errors = RunningDeviation()
-        for error in (stamps - truth)[settled].tolist():
+        for error in (stamps - truth)[steady].tolist():
             errors.add(error)
         return evaluated('real time', lost, growth, errors)
 

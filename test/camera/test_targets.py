@@ -116,7 +116,7 @@ def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Gene
 
 @pytest.mark.parametrize(('settings', 'view'), [(BOARD, 'outside'), (TAGS, 'base')], ids=['charuco', 'apriltag'])
 def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
-    scene, rng = replace(SMALL, view=view, turn=0.1), np.random.default_rng(3)
+    scene, rng = replace(SMALL, view=view, roll=0.1), np.random.default_rng(3)
     settings = replace(settings, view=view, rest_frames=1)
     reference = CameraReference(settings, target_of)
     reference.take(0, shot(scene, settings, Pose(), rng))
@@ -271,8 +271,8 @@ def assert_within(answers: Sequence[FrameAnswer], poses: Sequence[Pose], sigmas:
 
 SCENES = {
     'plain': Scene(),
-    'from the base': Scene(view='base', turn=0.4),
-    'turned': Scene(turn=-0.6),
+    'from the base': Scene(view='base', roll=0.4),
+    'turned': Scene(roll=-0.6),
     'wide lens': Scene(distortion=(-0.25, 0.12, 0.001, -0.0015), aim=(0.02, -0.002)),
     'oblique': Scene(tilt=(0.25, -0.3)),
     'uneven light': Scene(slope=(0.8, -0.5), shot_noise=0.15),
@@ -306,7 +306,7 @@ def test_reported_error_without_lens_has_its_true_size(tilt: tuple[float, float]
     shifts = rng.uniform(-3e-3, 3e-3, (10, 2)).tolist()
     moved = [Pose(x, y, rng.uniform(-0.05, 0.05), -2.6 * y, 2.6 * x) for x, y in shifts]
     settings = CameraSettings(spacing=0.025, radius=0.008, rest_frames=2)
-    answers = measured(Scene(turn=0.2, tilt=tilt), STILL + moved, settings)[2:]
+    answers = measured(Scene(roll=0.2, tilt=tilt), STILL + moved, settings)[2:]
     assert_within(answers, moved, 4.0)
     sd = np.sqrt(np.diagonal(np.array([a.covariance for a in answers]), axis1=1, axis2=2))
     off = np.array([[a.dx - p.dx, a.dy - p.dy, a.theta - p.theta] for a, p in zip(answers, moved, strict=True)])

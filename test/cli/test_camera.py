@@ -18,7 +18,7 @@ POSES = [Pose(), Pose(), Pose(1e-3, -2e-3, 0.02), Pose(-2e-3, 1e-3, -0.01)]
 @pytest.fixture(scope='module')
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder ``frames`` with one frame that shows nothing, and ``camera.yaml``."""
-    folder, scene, rng = tmp_path_factory.mktemp('film'), Scene(turn=0.1), np.random.default_rng(0)
+    folder, scene, rng = tmp_path_factory.mktemp('film'), Scene(roll=0.1), np.random.default_rng(0)
     (folder / 'frames').mkdir()
     images = [photograph(scene, [pose], rng) for pose in POSES]
     images.insert(3, np.full((480, 640), 30, np.uint8))

@@ -219,7 +219,7 @@ def test_a_rig_in_a_page_can_be_pasted(page: Path, text: str, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_every_case_is_on_the_page_with_its_picture() -> None:
-    message = gallery.kept()
+    message = gallery.stored()
     assert list(message) == [case.name for study in STUDIES for case in CASES if case.study == study]
     assert gallery.PAGE.read_text() == gallery.page(message)
     assert {path.stem for path in gallery.FIGURES.glob('*.png')} == set(message)
@@ -230,4 +230,4 @@ def test_every_case_is_on_the_page_with_its_picture() -> None:
 @pytest.mark.parametrize('case', {case.study: case for case in CASES}.values(), ids=lambda case: str(case.name))
 def test_the_program_says_what_the_page_has(case: Case, tmp_path: Path) -> None:
     message = gallery.answered(case, tmp_path)
-    assert gallery.same(message, gallery.kept()[case.name]), message
+    assert gallery.same(message, gallery.stored()[case.name]), message

@@ -52,7 +52,7 @@ def evaluated() -> dict[str, motion.Result]:
 def test_velocity_prediction_and_innovations(kind: str, evaluated: dict[str, motion.Result]) -> None:
     for axis in motion.figures([evaluated[kind]]):
         assert axis.velocity < 0.2 * axis.smoothed
-        assert axis.velocity < 1.1 * axis.own
+        assert axis.velocity < 1.1 * axis.velocity_sd
         # What is told of a base is a mean over some samples.
         assert (0.90 if kind == 'joint' else 0.92) < axis.inside < 0.98
         assert axis.predicted < 0.5 * axis.held

@@ -50,7 +50,7 @@ def calibrated(rig: Rig, truth: dict[str, float], pose: FloatArray, seed: int = 
 
 
 def test_a_turned_psd_is_found_with_its_sign_and_the_noise(nominal: Rig, pose: FloatArray) -> None:
-    found = calibrated(nominal, only(psd_2__rotation=0.02), pose, spread=(5e-6, 20e-6, 1e-3))
+    found = calibrated(nominal, only(psd_2__rotation=0.02), pose, reference_sd=(5e-6, 20e-6, 1e-3))
     rotated = found.values[AT['psd_2.rotation']]
     # Half the difference of the crosstalks looks the same, and gets its share.
     skew = found.values[AT['psd_2.crosstalk_xy']] - found.values[AT['psd_2.crosstalk_yx']]
