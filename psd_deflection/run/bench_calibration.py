@@ -71,7 +71,7 @@ def _step(folder: Path, asked: CalibrationOptions, *, ended: bool) -> BenchStep:
         return BenchStep(
             answer=None, progress=None, words=f'too little so far: {error}', warnings=tuple(warnings), ended=ended
         )
-    progress = progress_of(answer.found)
+    progress = progress_of(answer.calibration)
     return BenchStep(answer=answer, progress=progress, words='', warnings=tuple(warnings), ended=ended)
 
 

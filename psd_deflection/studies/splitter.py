@@ -46,13 +46,18 @@ class Lasers:
 
 
 class SplitterRule(NamedTuple):
-    """One rule. ``value`` and ``limit``: what is compared; ``unit`` of both; ``kept``: whether it holds."""
+    """One rule. ``value`` and ``limit``: what is compared; ``unit`` of both; ``satisfied``: whether it holds."""
 
     words: str
     value: float
     limit: float
     unit: str
-    kept: bool
+    satisfied: bool
+
+    def tree(self) -> dict[str, str | float | bool]:
+        """For JSON."""
+        rule = {'words': self.words, 'value': self.value, 'limit': self.limit, 'unit': self.unit}
+        return {**rule, 'kept': self.satisfied}
 
 
 class LightPhase(NamedTuple):

@@ -74,7 +74,7 @@ def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) 
     assert full.progress is not None
     assert (half.ended, full.ended) == (False, True)
     assert half.progress.determined > 0
-    left = [sum(parameter.left for parameter in progress.parameters) for progress in (half.progress, full.progress)]
+    left = [sum(parameter.sd_ratio for parameter in progress.parameters) for progress in (half.progress, full.progress)]
     assert left[1] < left[0]
     assert half.progress.seconds < full.progress.seconds == pytest.approx(len(LOADS), abs=0.01)
     assert bench.looks[1] - bench.looks[0] >= LEAST_PAUSE_S
@@ -87,7 +87,7 @@ def test_its_last_answer_is_that_of_the_recording(bag: Path, tmp_path: Path) -> 
     last = list(Bench(bag, tmp_path / 'growing').steps())[-1]
     assert last.answer is not None
     afterwards = psd_deflection.calibrate(bag, RIG_FILE)
-    assert last.answer.found.values.tolist() == afterwards.found.values.tolist()
+    assert last.answer.calibration.values.tolist() == afterwards.calibration.values.tolist()
     assert last.progress is not None
     json.dumps(last.progress.tree())
 

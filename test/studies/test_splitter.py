@@ -31,7 +31,7 @@ FILE = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
     ],
 )
 def test_the_three_rules(powers: tuple[float, float], allowed: float, kept: list[bool]) -> None:
-    assert [rule.kept for rule in rules(RIG, Lasers(powers, allowed))] == kept
+    assert [rule.satisfied for rule in rules(RIG, Lasers(powers, allowed))] == kept
 
 
 def test_the_numbers_of_the_rules() -> None:

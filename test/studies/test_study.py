@@ -78,7 +78,7 @@ def watched(folder: Path) -> StudyResult:
 RESULTS: Mapping[str, tuple[Maker, Callable[[Any], int]]] = {
     'Budgeted': (lambda _: psd_deflection.budget(load=(0.0, -10.0, 0.0)), lambda r: len(r.budget.lines)),
     'Calibrated': (lambda _: psd_deflection.calibrate([run()]), lambda r: len(r.tree()['parameters'])),
-    'Certified': (certificate, lambda r: len(r.found.poses)),
+    'Certified': (certificate, lambda r: len(r.certificate.poses)),
     'Checkup': (lambda _: psd_deflection.check(run()), lambda r: len(r.findings)),
     'Discovery': (lambda _: discovery(), lambda _: 3),
     'Identified': (lambda _: psd_deflection.identify(run()), lambda r: sum(len(axis.modes) for axis in r.axes)),

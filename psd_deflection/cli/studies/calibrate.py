@@ -212,7 +212,7 @@ def answer_of(path: str, asked: CalibrationOptions) -> Any:
     warnings: list[str] = []
     rig = asked.rig([path], warnings.append)
     answer = asked.calibrated(asked.runs([path], rig), rig, (), lambda words: None, warnings.append)
-    found, files, tree = answer.found, answer.files(), answer.tree()
+    found, files, tree = answer.calibration, answer.files(), answer.tree()
     cells: dict[str, object] = {
         'kind': found.kind,
         'rejected': found.rejected or '',

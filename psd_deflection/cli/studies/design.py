@@ -148,19 +148,21 @@ def splitter_of(args: argparse.Namespace) -> int:
             {**p._asdict(), 'status': p.status.name, **{name: getattr(p, name).tolist() for name in lists}}
             for p in phases
         ]
-        print_json({'rules': [rule._asdict() for rule in rules], 'phases': shown})
+        print_json({'rules': [rule.tree() for rule in rules], 'phases': shown})
     else:
         show_text(rules_text(rules))
         show()
         show_text(phases_text(phases))
-    return 0 if all(rule.kept for rule in rules) else 1
+    return 0 if all(rule.satisfied for rule in rules) else 1
 
 
 def rules_text(rules: Sequence[splitter.SplitterRule]) -> str:
     """A row for each rule."""
     rows = [['rule', 'is', 'limit', 'unit', 'kept']]
     for rule in rules:
-        rows.append([rule.words, f'{rule.value:.4g}', f'{rule.limit:.4g}', rule.unit, 'yes' if rule.kept else 'NO'])
+        rows.append(
+            [rule.words, f'{rule.value:.4g}', f'{rule.limit:.4g}', rule.unit, 'yes' if rule.satisfied else 'NO']
+        )
     return columns(rows)
 
 

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         largest=args.max_offset,
         exposure=args.exposure,
         solvers=args.solver,
-        counted=counted(args),
+        with_progress=counted(args),
     )
     with stage('comparing', quiet=args.json):
         found = validate(problem)

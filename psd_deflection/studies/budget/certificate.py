@@ -73,14 +73,14 @@ class CertificateProblem:
 class Certificate:
     """``inputs``: all; the first ones are the calibration's, whose ``correlations`` (m, m) are beside them.
 
-    ``poses`` (n, 3). ``found`` (n, 3): error of the pose by the rig file before the calibration, to first order.
+    ``poses`` (n, 3). ``as_found`` (n, 3): error of the pose by the rig file before the calibration, to first order.
     ``stated``: the expanded uncertainty at each pose.
     """
 
     poses: FloatArray
     inputs: tuple[InputQuantity, ...]
     correlations: FloatArray
-    found: FloatArray
+    as_found: FloatArray
     stated: tuple[Expanded, ...]
 
 
@@ -203,8 +203,12 @@ def _expanded(rows: Sequence[InputQuantity], correlations: FloatArray, pose: int
 class Conformity(NamedTuple):
     """Of one pose: as found and as left, each axis together."""
 
-    found: str
-    left: str
+    as_found: str
+    as_left: str
+
+    def tree(self) -> dict[str, str]:
+        """For JSON."""
+        return {'found': self.as_found, 'left': self.as_left}
 
 
 CONFORMS, FAILS, OPEN = 'conforms', 'does not conform', 'not decided'

@@ -61,12 +61,12 @@ _OPEN = '. . . . . . . . . . . . . . . .'
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certified(StudyResult):
-    """``found``: the numbers of ``problem``."""
+    """``certificate``: the numbers of ``problem``."""
 
     study, json_name = 'certificate', 'certificate.json'
     title = 'Certificate of calibration'
 
-    found: Certificate
+    certificate: Certificate
     problem: CertificateProblem
 
     @property
@@ -92,17 +92,19 @@ class Certified(StudyResult):
         if self.problem.limits is None:
             return []
         limits = np.array(self.problem.limits)
-        pairs = zip(self.found.found, self.found.stated, strict=True)
+        pairs = zip(self.certificate.as_found, self.certificate.stated, strict=True)
         return [verdict_of(error, uncertainty.uncertainty, limits) for error, uncertainty in pairs]
 
     def sentences(self) -> list[str]:
         """Return the largest U, the largest error as found, the verdict."""
-        largest = np.max([uncertainty.uncertainty for uncertainty in self.found.stated], axis=0)
-        out = [f'Expanded uncertainty for 95 %, the largest of {len(self.found.poses)} poses: {in_words(largest)}.']
-        out.append(f'As found the pose was wrong by up to {in_words(np.abs(self.found.found).max(axis=0))}.')
+        largest = np.max([uncertainty.uncertainty for uncertainty in self.certificate.stated], axis=0)
+        out = [
+            f'Expanded uncertainty for 95 %, the largest of {len(self.certificate.poses)} poses: {in_words(largest)}.'
+        ]
+        out.append(f'As found the pose was wrong by up to {in_words(np.abs(self.certificate.as_found).max(axis=0))}.')
         if verdicts := self.verdicts:
-            found, left = ({getattr(v, part) for v in verdicts} for part in ('found', 'left'))
-            out.append(f'As found: {_all_of(found)}; as left: {_all_of(left)}.')
+            as_found, as_left = ({getattr(v, part) for v in verdicts} for part in ('as_found', 'as_left'))
+            out.append(f'As found: {_all_of(as_found)}; as left: {_all_of(as_left)}.')
         return out
 
     def lines(self) -> list[str]:
@@ -111,8 +113,8 @@ class Certified(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """SI; (ΔX, ΔY, θ) in this order."""
-        verdicts: Sequence[Conformity | None] = self.verdicts or [None] * len(self.found.poses)
-        rows = zip(self.found.poses, self.found.found, self.found.stated, verdicts, strict=True)
+        verdicts: Sequence[Conformity | None] = self.verdicts or [None] * len(self.certificate.poses)
+        rows = zip(self.certificate.poses, self.certificate.as_found, self.certificate.stated, verdicts, strict=True)
         return {
             'unit': ['m', 'm', 'rad'],
             'probability': PROBABILITY,
@@ -122,23 +124,23 @@ class Certified(StudyResult):
                     'pose': pose.tolist(),
                     'as_found': error.tolist(),
                     **{name: value.tolist() for name, value in uncertainty._asdict().items()},
-                    'conformity': None if verdict is None else verdict._asdict(),
+                    'conformity': None if verdict is None else verdict.tree(),
                 }
                 for pose, error, uncertainty, verdict in rows
             ],
             'limits': None if self.problem.limits is None else list(self.problem.limits),
             'range': self.problem.calibration['range'],
-            'inputs': [{**row._asdict(), 'coefficients': row.coefficients.tolist()} for row in self.found.inputs],
-            'correlations': self.found.correlations.tolist(),
+            'inputs': [{**row._asdict(), 'coefficients': row.coefficients.tolist()} for row in self.certificate.inputs],
+            'correlations': self.certificate.correlations.tolist(),
             'provenance': {'version': __version__, 'calibration': self.problem.calibration['provenance']},
         }
 
     def table(self) -> Table:
         """Return one row a pose: what it was, how far the estimate was off as found, u_c and U; m, m, rad."""
-        stated = self.found.stated
+        stated = self.certificate.stated
         parts = (
-            ('', self.found.poses, 'pose'),
-            ('as_found_', self.found.found, 'error as found'),
+            ('', self.certificate.poses, 'pose'),
+            ('as_found_', self.certificate.as_found, 'error as found'),
             ('standard_', np.array([uncertainty.standard for uncertainty in stated]), 'standard uncertainty'),
             ('expanded_', np.array([uncertainty.uncertainty for uncertainty in stated]), 'expanded uncertainty, 95 %'),
         )
@@ -180,7 +182,7 @@ class Certified(StudyResult):
         head += [f'ν_eff {a}' for a in SYMBOLS] + [f'k {a}' for a in SYMBOLS] + [f'U {u}' for u in UNITS]
         rows = [head + (['as found', 'as left'] if classified else [])]
         for n, (pose, error, uncertainty) in enumerate(
-            zip(self.found.poses, self.found.found, self.found.stated, strict=True)
+            zip(self.certificate.poses, self.certificate.as_found, self.certificate.stated, strict=True)
         ):
             row = [str(n + 1), *display_values(pose), *display_values(error), *display_values(uncertainty.standard)]
             row += map(freedom_words, uncertainty.freedom.tolist())
@@ -190,12 +192,12 @@ class Certified(StudyResult):
 
     def chart(self) -> Chart:
         """Return the error of each pose as found with its expanded uncertainty, and the limits."""
-        number = np.arange(1.0, len(self.found.poses) + 1.0)
+        number = np.arange(1.0, len(self.certificate.poses) + 1.0)
         limits = self.problem.limits
         panels = []
         for i, (axis, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
-            errors = SHOWN[i] * np.array([error[i] for error in self.found.found])
-            expanded = SHOWN[i] * np.array([uncertainty.uncertainty[i] for uncertainty in self.found.stated])
+            errors = SHOWN[i] * np.array([error[i] for error in self.certificate.as_found])
+            expanded = SHOWN[i] * np.array([uncertainty.uncertainty[i] for uncertainty in self.certificate.stated])
             curve = Series('as found ± U', number, errors, 'blue', 'points', half_width=expanded)
             ends = () if limits is None else (-SHOWN[i] * limits[i], SHOWN[i] * limits[i])
             rules = [Rule(float(at), 'limit', across=True, colour='red') for at in ends]
@@ -208,7 +210,7 @@ class Certified(StudyResult):
         kinds = ('', 'as_found_', 'u_c_', 'nu_eff_', 'k_', 'U_')
         rows = [['pose', *(f'{kind}{name}' for kind in kinds for name in names)]]
         for n, (pose, error, uncertainty) in enumerate(
-            zip(self.found.poses, self.found.found, self.found.stated, strict=True), start=1
+            zip(self.certificate.poses, self.certificate.as_found, self.certificate.stated, strict=True), start=1
         ):
             values = (
                 pose,
@@ -223,20 +225,20 @@ class Certified(StudyResult):
 
     def _inputs(self, words: Any) -> list[list[str]]:
         head = ['cause', 'parameter', 'type', 'distribution', 'u', 'unit', 'nu']
-        head += [f'c_{a}_{n + 1}' for n in range(len(self.found.poses)) for a in ('dx', 'dy', 'theta')]
+        head += [f'c_{a}_{n + 1}' for n in range(len(self.certificate.poses)) for a in ('dx', 'dy', 'theta')]
         rows = [head]
-        for row in self.found.inputs:
+        for row in self.certificate.inputs:
             kind = 'A' if row.observed else 'B'
             row_words = [row.cause, row.parameter, kind, row.distribution, words(row.u), row.unit, words(row.freedom)]
             rows.append(row_words + [words(c) for c in row.coefficients.ravel().tolist()])
         return rows
 
     def _correlations(self, words: Any) -> list[list[str]]:
-        names = [row.parameter for row in self.found.inputs[: len(self.found.correlations)]]
+        names = [row.parameter for row in self.certificate.inputs[: len(self.certificate.correlations)]]
         rows = [['', *names]]
         rows += [
             [name, *map(words, coefficients)]
-            for name, coefficients in zip(names, self.found.correlations.tolist(), strict=True)
+            for name, coefficients in zip(names, self.certificate.correlations.tolist(), strict=True)
         ]
         return rows
 

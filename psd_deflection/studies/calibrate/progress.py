@@ -27,23 +27,28 @@ def in_words(i: int, value: float, sd: float | None = None) -> str:
 
 
 class ParameterProgress(NamedTuple):
-    """``value``: with its ±. ``left``: sd over that of the rig file. ``determined``: is it known better than that?
+    """``value``: with its ±. ``sd_ratio``: sd over that of the rig file. ``determined``: is it known better than that?
 
-    ``filled``: 0 (as the file has it) to 1 (``FULL`` is reached), in proportion to the logarithm of ``left``.
+    ``filled``: 0 (as the file has it) to 1 (``FULL`` is reached), in proportion to the logarithm of ``sd_ratio``.
     """
 
     name: str
     words: str
     value: str
-    left: float
+    sd_ratio: float
     determined: bool
 
     @property
     def filled(self) -> float:
         """Length of its bar, 0 to 1."""
-        if not self.determined or not self.left < 1.0:
+        if not self.determined or not self.sd_ratio < 1.0:
             return 0.0
-        return min(1.0, math.log(max(self.left, FULL)) / math.log(FULL))
+        return min(1.0, math.log(max(self.sd_ratio, FULL)) / math.log(FULL))
+
+    def tree(self) -> dict[str, Any]:
+        """For JSON and for the live page."""
+        names = {'name': self.name, 'words': self.words, 'value': self.value}
+        return {**names, 'left': self.sd_ratio, 'determined': self.determined, 'filled': self.filled}
 
 
 class Need(NamedTuple):
@@ -72,7 +77,7 @@ class CalibrationProgress(NamedTuple):
 
     def tree(self) -> dict[str, Any]:
         """For JSON and for the live page."""
-        rows = [{**p._asdict(), 'filled': p.filled} for p in self.parameters]
+        rows = [p.tree() for p in self.parameters]
         needs = [need._asdict() for need in self.needs]
         return {**self._asdict(), 'determined': self.determined, 'parameters': rows, 'needs': needs}
 
@@ -98,7 +103,7 @@ def progress_of(calibration: Calibration) -> CalibrationProgress:
                 name=NAMES[i],
                 words=WORDS[NAMES[i]],
                 value=in_words(i, float(calibration.values[i]), float(calibration.sd[i])),
-                left=float(share_of_prior[i]),
+                sd_ratio=float(share_of_prior[i]),
                 determined=NAMES[i] in known,
             )
             for i in REPORTED

@@ -35,7 +35,7 @@ from psd_deflection.studies.study import (
 
 @dataclass(frozen=True, repr=False)
 class Calibrated(StudyResult):
-    """``found``: the fit and what it means. ``rig``: as it was known, with the parameter file it has, if any.
+    """``calibration``: the fit and what it means. ``rig``: as it was known, with the parameter file it has, if any.
 
     ``date``: of the calibration, for the provenance. ``notify``: takes warnings.
     """
@@ -43,7 +43,7 @@ class Calibrated(StudyResult):
     study, json_name = 'calibrate', 'calibration.json'
     title = 'Calibration'
 
-    found: Calibration
+    calibration: Calibration
     rig: Rig
     params_file: str | Path | None
     date: str
@@ -52,12 +52,12 @@ class Calibrated(StudyResult):
     @property
     def sources(self) -> dict[str, str]:
         """Version, date, recordings with their digests."""
-        runs = {f'recording {n}': named(run.name, run.digest, 64) for n, run in enumerate(self.found.runs, 1)}
+        runs = {f'recording {n}': named(run.name, run.digest, 64) for n, run in enumerate(self.calibration.runs, 1)}
         return {'version': __version__, 'date': self.date, **runs}
 
     def sentences(self) -> list[str]:
         """Return the answer in one sentence, the dark levels, and what is left open."""
-        calibration = self.found
+        calibration = self.calibration
         statements = [sentence(calibration), *map(words_of_level, calibration.dark)]
         statements += [
             f'undetermined: {", ".join(n.names)}; needed: {n.motion}' for n in progress_of(calibration).needs
@@ -68,11 +68,11 @@ class Calibrated(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """Parameters with covariance, what is left open, noise, gap, provenance."""
-        return result(self.found, self.date)
+        return result(self.calibration, self.date)
 
     def table(self) -> Table:
         """One row a parameter: ``value``, ``sd``, what the ``file`` had, what the new one has (``used``), ``unit``."""
-        calibration, at = self.found, list(REPORTED)
+        calibration, at = self.calibration, list(REPORTED)
         return Table(
             text_column('parameter', [NAMES[i] for i in at], 'of the rig'),
             [
@@ -89,11 +89,11 @@ class Calibrated(StudyResult):
         """Before and after, parameters, what is left open, noise, dark levels, what to do next."""
         from psd_deflection.studies.calibrate.pictures import sections
 
-        return sections(self.found)
+        return sections(self.calibration)
 
     def rig_yaml(self) -> str:
         """Return the user's parameter file with the calibration, comments kept; without one what describes the rig."""
-        calibration = self.found
+        calibration = self.calibration
         values, effects = values_of(calibration, self.date)
 
         def edit(text: str, path: Path) -> str:

@@ -40,8 +40,8 @@ from psd_deflection.studies.check.wirings import (
     WiringFit,
     differences,
     fitting_wirings,
-    misfit,
     pattern,
+    residuals,
     scales_of,
 )
 from psd_deflection.studies.loads.alignment import LatePsd, aligned
@@ -96,7 +96,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
         most = int(np.argmax(np.abs(held[present][:, group[0]])))
         alone = np.zeros((2, 3))
         alone[1, group] = loads[: n * size].reshape(n, size, 3).mean(axis=1)[present][most, group]
-        before, after = _simulated(rig, alone, settled=True)
+        before, after = _simulated(rig, alone, at_rest=True)
         # The way that the push is named.
         expected = np.sign(alone[1, group[0]]) * (after - before)
         moved = np.append(expected, (0.0, 0.0))
@@ -106,9 +106,9 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     return Responses(tuple(pushes), slopes[-1], np.sqrt(covariance[-1, -1] * variance))
 
 
-def _simulated(rig: Rig, loads: FloatArray, *, settled: bool = False) -> FloatArray:
-    """Dots x1 y1 x2 y2 (n, 4), m, under ``loads`` (n, 3), N, N, N m; ``settled``: at rest under each."""
-    return np.asarray(ForwardModel(rig, settled=settled).run(loads).true_dots.T)
+def _simulated(rig: Rig, loads: FloatArray, *, at_rest: bool = False) -> FloatArray:
+    """Dots x1 y1 x2 y2 (n, 4), m, under ``loads`` (n, 3), N, N, N m; ``at_rest``: at rest under each."""
+    return np.asarray(ForwardModel(rig, settled=at_rest).run(loads).true_dots.T)
 
 
 def block_means(samples: FloatArray, n: int) -> FloatArray:
@@ -228,7 +228,7 @@ def check(problem: CheckProblem) -> Checkup:
     # Pushes that are not there yet are no mistake.
     wrong = light or problem.late or problem.notes or any(f.name != 'load_coverage' for f in findings)
     verdict = WRONG if wrong else RIGHT if determined else CANNOT_TELL
-    sizes = tuple(p.misfit(best.wiring)[1] if p.observed else math.nan for p in pushes)
+    sizes = tuple(p.match(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(
         rig=rig,
         verdict=verdict,
@@ -265,7 +265,7 @@ def _wiring_findings(
     """How ``best`` differs from the rig file's wiring; nothing if that explains the pushes too."""
     if any(c.wiring == file for c in wirings):
         return []
-    gained = misfit(file, observed, best.reversed_loads)[0] - best.misfit
+    gained = residuals(file, observed, best.reversed_loads)[0] - best.residual
     also = _same_to_first_order(file, observed, best)
     if (alternatives := len(wirings) - 1) > 0:
         also += (f'{alternatives} other wiring{"s" if alternatives > 1 else ""}, which these pushes cannot tell apart',)
@@ -277,9 +277,9 @@ def _wiring_findings(
 
 def _same_to_first_order(file: Wiring, observed: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
     """Return whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
-    rotated = tuple(load for p in observed if p.misfit(file)[1] < 0.0 for load in p.loads)
-    total, worst = misfit(file, observed, rotated)
-    same = worst <= LIMIT and total <= best.misfit + MARGIN
+    rotated = tuple(load for p in observed if p.match(file)[1] < 0.0 for load in p.loads)
+    total, worst = residuals(file, observed, rotated)
+    same = worst <= LIMIT and total <= best.residual + MARGIN
     return (f'load_sign of {" ".join(rotated)}',) if same else ()
 
 
@@ -291,7 +291,7 @@ def _load_findings(observed: Sequence[PushResponse], wiring: WiringFit) -> list[
     sizes = np.full(3, math.nan)
     for p in observed:
         if p.sized:
-            sizes[[_LOADS.index(load) for load in p.loads]] = p.misfit(wiring.wiring)[1]
+            sizes[[_LOADS.index(load) for load in p.loads]] = p.match(wiring.wiring)[1]
     return out + unit_findings(sizes)[0]
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the 128 wirings of two PSDs explain how the dots answered to pushes, of free size: the misfit is the
+"""Which of the 128 wirings of two PSDs explain how the dots answered to pushes, of free size: the residual is the
 share of the squared movement that the expected pattern leaves, 0 to 1. A wrong sign leaves half or more, 25 degrees
 a fifth."""
 
@@ -46,10 +46,10 @@ def wirings_of(file: Wiring) -> Sequence[Wiring]:
 
 
 MARGIN = 0.35
-"""A wiring whose misfit is larger than the best one's by more than this is ruled out."""
+"""A wiring whose residual is larger than the best one's by more than this is ruled out."""
 
 LIMIT = 0.35
-"""A wiring with a larger misfit to any one push does not explain it."""
+"""A wiring with a larger residual of any one push does not explain it."""
 
 OBSERVED = 6.0
 """A movement below so many of its standard deviations says nothing."""
@@ -103,7 +103,7 @@ class PushResponse:
         variance = float(np.mean(self.sd**2)) * (2.0 if self.only_twist else 1.0)
         return bool(moved @ moved > OBSERVED**2 * variance)
 
-    def misfit(self, wiring: Wiring) -> tuple[float, float]:
+    def match(self, wiring: Wiring) -> tuple[float, float]:
         """Share of the movement that ``wiring`` leaves unexplained, and the size of the movement over the expected one.
 
         The size is negative if the push went the other way.
@@ -139,20 +139,20 @@ def _pattern(dots: FloatArray, only_twist: bool) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class WiringFit:
-    """A wiring that explains the pushes, if ``reversed_loads`` went the other way; ``misfit`` is summed over them."""
+    """A wiring that explains the pushes, if ``reversed_loads`` went the other way; ``residual`` is summed over them."""
 
     wiring: Wiring
-    misfit: float
+    residual: float
     reversed_loads: tuple[str, ...] = ()
 
 
-def misfit(
+def residuals(
     wiring: Wiring, responses: Sequence[PushResponse], reversed_loads: Sequence[str] = ()
 ) -> tuple[float, float]:
-    """(sum over the pushes, worst push) of the misfit, with the sign of some loads turned."""
+    """(sum over the pushes, worst push) of the residual, with the sign of some loads turned."""
     shares = []
     for response in responses:
-        share, size = response.misfit(wiring)
+        share, size = response.match(wiring)
         backwards = set(response.loads) <= set(reversed_loads)
         # A movement against the push is not explained at all.
         shares.append(share if (size < 0.0) == backwards else 1.0)
@@ -170,12 +170,12 @@ def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
         for some in itertools.combinations(loads_of_responses, count):
             loads = tuple(itertools.chain.from_iterable(some))
             for wiring in WIRINGS:
-                total, worst = misfit(wiring, responses, loads)
+                total, worst = residuals(wiring, responses, loads)
                 if worst <= LIMIT:
                     fits.append(WiringFit(wiring, total, loads))
         if fits:
-            fits.sort(key=lambda c: c.misfit)
-            return [c for c in fits if c.misfit <= fits[0].misfit + MARGIN]
+            fits.sort(key=lambda c: c.residual)
+            return [c for c in fits if c.residual <= fits[0].residual + MARGIN]
     return []
 
 

@@ -7,7 +7,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -112,7 +112,7 @@ class Conclusion(StudyResult):
 
     def sentences(self) -> list[str]:
         """What is missing, or that nothing is, and which effects may have one cause."""
-        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.beyond]
+        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.small_terms]
 
     @property
     def unexplained(self) -> bool:
@@ -120,7 +120,7 @@ class Conclusion(StudyResult):
         return self.prediction is not None and self.prediction.unexplained
 
     @property
-    def beyond(self) -> list[str]:
+    def small_terms(self) -> list[str]:
         """What small terms beyond the named effects do together, in a sentence; nothing if they do nothing."""
         return [self.prediction.sentence(self.workspace)] if self.prediction is not None and self.unexplained else []
 
@@ -132,7 +132,7 @@ class Conclusion(StudyResult):
     def lines(self) -> list[str]:
         """Return the sentences in one line, then what is unknown."""
         unknown = [f'unknown: {u.signature}' for u in self.unknown]
-        limits = [f'limit: {x.limit}; {x.beyond}' for x in self.search.limits]
+        limits = [f'limit: {x.limit}; {x.further}' for x in self.search.limits]
         return [self.sentence, *unknown, *limits, f'{self.simulations} forward simulations']
 
     def tree(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ class Conclusion(StudyResult):
             ],
             'ties': self._ties(),
             'covariance': covariance_tree(self.fit, self.effects),
-            'limits': [asdict(x) for x in self.search.limits],
+            'limits': [x.tree() for x in self.search.limits],
             'remainder': None if self.remainder is None else self.remainder.tree(),
             'setup': [],
             'moves': None,
@@ -291,7 +291,7 @@ class RigConclusion(Conclusion):
         missing = _missing(self, ' besides' if setup else '')
         tied = [t.sentence for t in ties(self.effects)]
         annotated = _as_annotated(self)
-        return [s for s in (setup, missing, *tied, annotated, _moved(self), law_sentence(self), *self.beyond) if s]
+        return [s for s in (setup, missing, *tied, annotated, _moved(self), law_sentence(self), *self.small_terms) if s]
 
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""

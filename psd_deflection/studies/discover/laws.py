@@ -160,11 +160,11 @@ class LawSearch:
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
         self.ws, self.start, self.penalty = ws, start, penalty
         self.last = min(ws.simulations + BUDGET, max(ws.simulations, ALTOGETHER))
-        self.found = responses(ws, start)
-        self.listed = list(terms(self.found))
+        self.responses = responses(ws, start)
+        self.listed = list(terms(self.responses))
         if len(ws.observations) == 1:
             # In another recording the events have other times.
-            self.listed += switchings(self.found)
+            self.listed += switchings(self.responses)
         self.tried = len(self.listed) * len(sought(ws.psds))
 
     def cost(self, laws: Sequence[Law], fit: Fit) -> float:
@@ -194,14 +194,14 @@ class LawSearch:
 
     def first(self) -> list[LawTrial]:
         """Laws of one term, the best first."""
-        scored = score(self.found, self.listed)
+        scored = score(self.responses, self.listed)
         known: set[tuple[str, str, tuple[str, ...]]] = set()
         picked: list[Scored] = []
         for s in scored:
             key = (s.target, s.term.form, s.term.of)
             if key not in known and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
                 known.add(key)
-                picked.append(with_better_level(self.found, s))
+                picked.append(with_better_level(self.responses, s))
         quick = [self.trial([law_on(s.target, s.term)], self.start.effects, 3) for s in picked]
         quick.sort(key=lambda t: t.cost)
         full = [self.trial(t.laws, t.beside, 8) for t in quick[:FOLLOWED]]
@@ -238,7 +238,7 @@ class LawSearch:
         for more in switchings(residuals, (law.acts_on.removeprefix('static_'),)):
             times = tuple(sorted({*term.times} ^ {*more.times}))
             if more.of == term.of and times:
-                better = with_better_times(self.found, law.acts_on, LawTerm(term.form, term.of, times=times))
+                better = with_better_times(self.responses, law.acts_on, LawTerm(term.form, term.of, times=times))
                 both = dataclasses.replace(term, times=better.times)
                 now = dataclasses.replace(law, terms=(both, *law.terms[1:]))
                 best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)

@@ -33,7 +33,7 @@ from psd_deflection.studies.discover.search.screen import (
     signatures_beside,
 )
 from psd_deflection.studies.discover.search.smooth import Table
-from psd_deflection.studies.discover.search.trials import FAR, far
+from psd_deflection.studies.discover.search.trials import FAR, is_far_off
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import likely_jumps
 
@@ -105,7 +105,7 @@ class RecordedRig(Machine):
                 name: [*observed, *(v for v in beside[name] if v not in observed)] for name, observed in values.items()
             }
         listed = candidates([*library, *more], self.recorded.physics, values)
-        if fit is None or not far(fit):
+        if fit is None or not is_far_off(fit):
             signatures = [(c, self.bank.get(c, ws)) for c in listed]
         else:
             # A large effect changes the signatures of the others.

@@ -43,12 +43,12 @@ LEAST_S, FARTHEST_S = 0.0005, 1.0
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Movement:
     """Sums over block means: ``squared`` of the readings; ``cross`` (3, 2P, 2P): load, simulated dot, device's channel;
-    ``own`` (3, 3): of the simulated movements, load by load; ``noise``: variance of a block's mean, m^2.
+    ``load_products`` (3, 3): of the simulated movements, load by load; ``noise``: variance of a block's mean, m^2.
     """
 
     squared: float
     cross: FloatArray
-    own: FloatArray
+    load_products: FloatArray
     noise: float
 
 
@@ -106,18 +106,18 @@ def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     signs = np.array(wiring.signs)[list(dots)]
     along = np.einsum('d,kd->k', signs, m.cross[:, range(len(dots)), columns])
     # A load in kN or mN is a million times weaker or stronger than the others.
-    applied = np.diag(m.own) > 1e-18 * float(np.diag(m.own).max())
+    applied = np.diag(m.load_products) > 1e-18 * float(np.diag(m.load_products).max())
     sizes = np.full(3, np.nan)
     if not applied.any():
         return m.squared, sizes
     at = np.flatnonzero(applied)
-    f = m.own[np.ix_(at, at)]
+    f = m.load_products[np.ix_(at, at)]
     scale = np.sqrt(np.diag(f))
     sizes[at] = np.linalg.lstsq(f / np.outer(scale, scale), along[at] / scale, rcond=1e-6)[0] / scale
     residual = max(m.squared - float(along[at] @ sizes[at]), 0.0)
     # A load that moved nothing that stands out has no size.
     with np.errstate(invalid='ignore'):
-        sizes[sizes**2 * np.diag(m.own) < OBSERVED * m.noise + 1e-3 * residual] = np.nan
+        sizes[sizes**2 * np.diag(m.load_products) < OBSERVED * m.noise + 1e-3 * residual] = np.nan
     return residual, sizes
 
 
@@ -149,7 +149,7 @@ def correct_wiring(
     """The recordings as they would be if wiring, signs and units were right; what was wrong; lines for the rig file."""
     file = Wiring.from_rig(observations[0].rig)
     m = movement_sums(observations, base)
-    if m.squared <= 0.0 or float(np.trace(m.own)) <= 0.0:
+    if m.squared <= 0.0 or float(np.trace(m.load_products)) <= 0.0:
         return list(observations), [], {}
     noise = noise_energy(observations)
     tried = []

@@ -32,10 +32,10 @@ class IdentifyProblem:
     marks: tuple[Moment, ...] = ()
 
 
-def read_identify(opened: Opened, counted: Counted = iter) -> IdentifyProblem:
+def read_identify(opened: Opened, with_progress: Counted = iter) -> IdentifyProblem:
     """Solve every trusted sample. Raises RecordingError if there are none."""
     recording, rig = opened.recording, opened.rig
-    run = read_run(recording, Pipeline(rig), counted(recording.blocks()))
+    run = read_run(recording, Pipeline(rig), with_progress(recording.blocks()))
     rate = rig.converter.sample_rate_hz
     solved = solver_from_rig(rig.estimator.solver, rig).solve_many(run.dots, dot_noise_variances(rig))
     place = np.rint((run.t_ns - run.t_ns[0]) * 1e-9 * rate).astype(np.int64)

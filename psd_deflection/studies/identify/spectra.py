@@ -102,14 +102,14 @@ def loudest_peak(samples: FloatArray, rate: float, noise: float, beside: Sequenc
 
 @dataclass(frozen=True)
 class ColouredNoise:
-    """Noise of the density ``white`` + ``walk`` / (2 - 2 cos w), one-sided: at least that of an autoregression."""
+    """Noise of density ``white`` + ``random_walk`` / (2 - 2 cos w), one-sided: at least that of an autoregression."""
 
     white: float
-    walk: float
+    random_walk: float
 
     def density(self, f: FloatArray, rate: float) -> FloatArray:
         """At the frequencies ``f``, Hz."""
-        return self.white + self.walk / np.maximum(2.0 - 2.0 * np.cos(2.0 * np.pi * f / rate), 1e-9)
+        return self.white + self.random_walk / np.maximum(2.0 - 2.0 * np.cos(2.0 * np.pi * f / rate), 1e-9)
 
     def deviation(self, lowest: float, rate: float) -> float:
         """Standard deviation of a sample, of what lies above ``lowest`` Hz."""

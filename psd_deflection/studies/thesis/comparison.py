@@ -256,13 +256,13 @@ METHODS: Mapping[str, tuple[str, dict[str, Any]]] = {
 
 
 class SpotRun(NamedTuple):
-    """One run. ``t`` (n,) s: middle of each block; ``truth`` (n, 3), ``found`` by method (n, 3): m, m, rad."""
+    """One run. ``t`` (n,) s: middle of each block; ``truth`` (n, 3), ``estimates`` by method (n, 3): m, m, rad."""
 
     force: float
     diameter: float
     t: FloatArray
     truth: FloatArray
-    found: Mapping[str, FloatArray]
+    estimates: Mapping[str, FloatArray]
 
 
 @functools.cache
@@ -307,7 +307,7 @@ def spot_changes() -> list[SpotChange]:
         small, large = (spot_run(force, diameter) for diameter in DIAMETERS)
         held = small.t > REST_S + HELD_S - 1.0
         for method in METHODS:
-            largest = np.abs(large.found[method] - small.found[method]).max(axis=0)
-            errors = [(run.found[method] - run.truth)[held].mean(axis=0) for run in (small, large)]
+            largest = np.abs(large.estimates[method] - small.estimates[method]).max(axis=0)
+            errors = [(run.estimates[method] - run.truth)[held].mean(axis=0) for run in (small, large)]
             out.append(SpotChange(force, method, largest, (errors[0], errors[1])))
     return out

@@ -352,11 +352,11 @@ def large_spots() -> Figure:
         small, large = (spot_run(force, diameter) for diameter in DIAMETERS)
         for ax, axis, label, unit in zip(column, (2, 0, 1), ('θ, deg', 'ΔX, mm', 'ΔY, mm'), units, strict=True):
             ax.plot(small.t, unit * small.truth[:, axis], color='black', lw=0.8, label='truth')
-            for method, color in zip(small.found, (_ORANGE, _BLUE), strict=True):
-                ax.plot(small.t, unit * small.found[method][:, axis], color=color, lw=1.2, label=f'{method}, 1 mm')
+            for method, color in zip(small.estimates, (_ORANGE, _BLUE), strict=True):
+                ax.plot(small.t, unit * small.estimates[method][:, axis], color=color, lw=1.2, label=f'{method}, 1 mm')
                 shown = slice(0, None, 5)
                 ax.plot(
-                    *(large.t[shown], unit * large.found[method][shown, axis], '.'),
+                    *(large.t[shown], unit * large.estimates[method][shown, axis], '.'),
                     color=color,
                     ms=4,
                     label=f'{method}, 2 mm',

@@ -60,16 +60,16 @@ def read_validate(
     largest: float = 1.0,
     exposure: float = 0.0,
     solvers: Sequence[str] = (),
-    counted: Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]] = iter,
+    with_progress: Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]] = iter,
 ) -> ValidateProblem:
     """Read the recording and its reference, or the one of a file. Raises RecordingError if one lacks what is needed.
 
-    ``solvers``: those that are compared beside the rig's; ``ALL``: every one that can solve the rig. ``counted`` hands
-    blocks on and counts them.
+    ``solvers``: those that are compared beside the rig's; ``ALL``: every one that can solve the rig. ``with_progress``
+    hands blocks on and counts them.
     """
     recording, rig = opened.recording, opened.rig
     references = references_of(recording) if reference is None else read_references(reference)
-    run = read_run(recording, Pipeline(rig), counted(recording.blocks()))
+    run = read_run(recording, Pipeline(rig), with_progress(recording.blocks()))
     compared = _solvers(rig, solvers)
     start = int(run.t_ns[0])
     return ValidateProblem(

@@ -148,8 +148,8 @@ def test_as_found_is_what_the_old_values_would_have_done(certificate: Certificat
     rows = {row.parameter: row for row in certificate.inputs if row.cause == 'calibration'}
     # The old rotation was 12 mrad too small, the old gain 0.004 too large.
     expected = -0.012 * rows['psd_1.rotation'].coefficients + 0.004 * rows['psd_2.gain_y'].coefficients
-    assert certificate.found == pytest.approx(expected, rel=1e-12)
-    assert np.abs(certificate.found[0]).min() > 1e-7
+    assert certificate.as_found == pytest.approx(expected, rel=1e-12)
+    assert np.abs(certificate.as_found[0]).min() > 1e-7
 
 
 def test_the_scale_of_the_reference_is_that_of_each_pose(certificate: Certificate) -> None:
@@ -235,7 +235,7 @@ def test_the_rule_is_guarded_by_u(
     found: tuple[float, ...], uncertainty: tuple[float, ...], verdict: tuple[str, str]
 ) -> None:
     got = verdict_of(np.array(found), np.array(uncertainty), np.ones(3))
-    assert (got.found, got.left) == verdict
+    assert (got.as_found, got.as_left) == verdict
 
 
 def _certified(certificate: Certificate, **changes: Any) -> Certified:
@@ -254,7 +254,7 @@ def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> No
     for n, (row, message) in enumerate(zip(others, certificate.stated, strict=True)):
         assert row[0] == str(n + 1)
         assert len(row) == len(head)
-        parts = (certificate.poses[n], certificate.found[n], message.standard)
+        parts = (certificate.poses[n], certificate.as_found[n], message.standard)
         numbers = [scale * v for part in parts for scale, v in zip(SCALES, part.tolist(), strict=True)]
         assert [float(v) for v in row[1:10]] == pytest.approx(numbers, abs=6e-4)
         assert row[10:13] == [f'{v:.0f}' for v in message.freedom.tolist()]
@@ -268,7 +268,7 @@ def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> No
 
 def test_mixed_verdicts_are_all_named(certificate: Certificate) -> None:
     # One pose was a metre off, the others not at all.
-    wrong = replace(certificate, found=np.diag([1.0, 0.0, 0.0]))
+    wrong = replace(certificate, as_found=np.diag([1.0, 0.0, 0.0]))
     message = _certified(wrong, limits=(0.5, 0.5, 0.5)).sentences()[2]
     assert message == 'As found: conforms, does not conform; as left: every pose conforms.'
     message = _certified(certificate, limits=(1e-12, 1.0, 1.0)).sentences()[2]
@@ -294,7 +294,7 @@ def test_the_files_have_all_digits(certificate: Certificate) -> None:
         message = certificate.stated[n]
         parts: Mapping[str, FloatArray] = {
             '': certificate.poses[n],
-            'as_found_': certificate.found[n],
+            'as_found_': certificate.as_found[n],
             'u_c_': message.standard,
             'nu_eff_': message.freedom,
             'k_': message.factor,
@@ -324,7 +324,7 @@ def test_the_tree_and_the_table_have_the_same_numbers(certificate: Certificate) 
         assert one['standard'] == [columns[f'standard_{axis}'].values[n] for axis in AXES]
         assert one['uncertainty'] == [columns[f'expanded_{axis}'].values[n] for axis in AXES]
         assert one['uncertainty'] == certificate.stated[n].uncertainty.tolist()
-        assert one['conformity'] == answer.verdicts[n]._asdict()
+        assert one['conformity'] == answer.verdicts[n].tree()
     plain = _certified(certificate).tree()
     assert plain['limits'] is None
     assert [one['conformity'] for one in plain['poses']] == [None] * 3

@@ -417,7 +417,7 @@ def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
 def calibrated(*loads: tuple[float, float, float]) -> CalibrationProgress:
     """By loads of a second each and a reference."""
     made = psd_deflection.simulate(None, [(0, 0, 0), *loads], seconds=1, seed=3)
-    return progress_of(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found)
+    return progress_of(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').calibration)
 
 
 @pytest.mark.slow
@@ -428,7 +428,7 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
     for progress in (along_x, all_round):
         assert ROTATED not in [need.motion for need in progress.needs]
         for p in progress.parameters:
-            assert p.left <= OPEN or not p.determined
+            assert p.sd_ratio <= OPEN or not p.determined
         assert {p.name for p in progress.parameters if not p.determined} == {
             n for need in progress.needs for n in need.names
         }
@@ -448,12 +448,12 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
     [(1.0, True, 0.0), (0.1, True, 0.5), (0.01, True, 1.0), (1e-5, True, 1.0), (0.1, False, 0.0), (np.nan, True, 0.0)],
 )
 def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(left: float, determined: bool, filled: float) -> None:
-    parameter = ParameterProgress(name='n', words='', value='', left=left, determined=determined)
+    parameter = ParameterProgress(name='n', words='', value='', sd_ratio=left, determined=determined)
     assert parameter.filled == pytest.approx(filled)
 
 
 def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
-    parameter = ParameterProgress(name='n', words='a', value='b', left=0.1, determined=True)
+    parameter = ParameterProgress(name='n', words='a', value='b', sd_ratio=0.1, determined=True)
     tree = CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree()
     row, need = {**parameter._asdict(), 'filled': parameter.filled}, {'motion': 'push', 'names': ('n',)}
     assert tree.pop('parameters') == [row]
@@ -475,7 +475,7 @@ def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
 
 def test_rejection_and_covariance_are_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
-    found = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found, rejected='')
+    found = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').calibration, rejected='')
     assert result(found, '2026-11-26')['rejected'] is None
     assert result(replace(found, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'
     # One parameter is known exactly: it is correlated with nothing.

@@ -252,16 +252,16 @@ def test_a_push_is_observed_beyond_six_deviations(
 
 def test_unexplained_share_is_square_outside_pattern() -> None:
     # (3, 4) along (2, 0): 1.5 times as large, and 16 of 25 are left.
-    assert push([3.0, 4.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]).misfit(PLAIN) == pytest.approx((0.64, 1.5))
-    assert push([-3.0, 0.0, 0.0, 4.0], [2.0, 0.0, 0.0, 0.0]).misfit(PLAIN) == pytest.approx((0.64, -1.5))
+    assert push([3.0, 4.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]).match(PLAIN) == pytest.approx((0.64, 1.5))
+    assert push([-3.0, 0.0, 0.0, 4.0], [2.0, 0.0, 0.0, 0.0]).match(PLAIN) == pytest.approx((0.64, -1.5))
     # In metres of the PSD first: twice x1 and half y1 are (6, 2).
     scaled = push([3.0, 4.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], scales=(2.0, 0.5, 1.0, 1.0))
-    assert scaled.misfit(PLAIN) == pytest.approx((4.0 / 40.0, 3.0))
+    assert scaled.match(PLAIN) == pytest.approx((4.0 / 40.0, 3.0))
     # Of a turn the difference of the dots: (3 - 1, 4 - 0) along (2 - 0, 0).
     turn = push([3.0, 4.0, 1.0, 0.0], [2.0, 0.0, 0.0, 0.0], only_twist=True)
-    assert turn.misfit(PLAIN) == pytest.approx((16.0 / 20.0, 1.0))
+    assert turn.match(PLAIN) == pytest.approx((16.0 / 20.0, 1.0))
     # With the wiring turned the PSDs see x1 = -y2, y1 = x2, x2 = x1, y2 = y1.
-    assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).misfit(ROTATED) == pytest.approx((0.0, 1.0), abs=1e-12)
+    assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).match(ROTATED) == pytest.approx((0.0, 1.0), abs=1e-12)
 
 
 def of_plate(*rows: tuple[str, float], lean: float = 0.0) -> list[wirings.PushResponse]:
@@ -278,7 +278,7 @@ def of_plate(*rows: tuple[str, float], lean: float = 0.0) -> list[wirings.PushRe
 def test_three_pushes_leave_one_wiring_and_two_leave_several() -> None:
     found = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0), ('tz', 10.0)))
     assert [(f.wiring, f.reversed_loads) for f in found] == [(PLAIN, ())]
-    assert found[0].misfit == pytest.approx(0.0, abs=1e-12)
+    assert found[0].residual == pytest.approx(0.0, abs=1e-12)
     # Along X and Y both PSDs move alike: they may be exchanged.
     both = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0)))
     assert [f.wiring for f in both] == [PLAIN, Wiring(exchanged=True)]

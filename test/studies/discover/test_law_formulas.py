@@ -393,7 +393,7 @@ class Given(laws.LawSearch):
             Workspace, SimpleNamespace(size=200, simulations=0, physics=Workspace([make_observation()]).physics)
         )
         self.start = cast(Fit, SimpleNamespace(effects=()))
-        self.penalty, self.last, self.found, self.listed = 3.0, 600, [], []
+        self.penalty, self.last, self.responses, self.listed = 3.0, 600, [], []
 
     def trial(self, found: Any, beside: Any, iterations: int) -> laws.LawTrial:
         key = ' '.join(v for law in found for t in law.terms for v in t.of), ' '.join(a.effect.name for a in beside)

@@ -24,7 +24,7 @@ from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
 from psd_deflection.studies.discover.search.localise import dependences, localise, regressors
 from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.search import Search, mistake
-from psd_deflection.studies.discover.search.trials import far
+from psd_deflection.studies.discover.search.trials import is_far_off
 from psd_deflection.studies.discover.search.weighing import coincidences
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, load_sizes, movement_sums, noise_energy
@@ -143,7 +143,7 @@ def test_effects_beside_late_loads_are_simulated_anew(late: float, again: bool) 
 def test_a_fit_is_far_beyond_ten_a_value() -> None:
     fit = refit(Plant(pictures(A), noise()), ())
     for more, is_far in ((0.0, False), (0.1, True)):
-        assert far(dataclasses.replace(fit, chi2=10.0 * 6 * FINE + more)) is is_far
+        assert is_far_off(dataclasses.replace(fit, chi2=10.0 * 6 * FINE + more)) is is_far
 
 
 def test_another_sample_rate_is_tried_from_afar() -> None:
@@ -179,9 +179,9 @@ def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) ->
         (limit,) = found.limits
         assert limit.limit == f'{budget * max(effects, 1)} simulations for {effects} effect{"s" * (effects != 1)}'
         beyond = sorted(set(names) - set(named(found.fit)))
-        assert limit.beyond.startswith(f'{len(beyond)} more term')
-        assert all(name in limit.beyond.split('(')[1].split(')')[0] for name in beyond)
-        left, of = (float(words.split()[0]) for words in limit.beyond.split('be ')[-1].split(' instead of '))
+        assert limit.further.startswith(f'{len(beyond)} more term')
+        assert all(name in limit.further.split('(')[1].split(')')[0] for name in beyond)
+        left, of = (float(words.split()[0]) for words in limit.further.split('be ')[-1].split(' instead of '))
         # Six effects of 900 in 14400 values.
         assert left < 0.9 * of
 
@@ -222,7 +222,7 @@ def test_stand_in_effect_is_reported_and_not_added() -> None:
     assert named(found.fit) == ['a']
     (limit,) = found.limits
     assert limit.limit.startswith('b beside 1 effect explains less than 20% of what remains')
-    assert limit.beyond.startswith('1 more term (b) would pass')
+    assert limit.further.startswith('1 more term (b) would pass')
     full = ran(searching(plant, shown, 'abc'))
     assert (named(full.fit), full.limits) == (['a', 'b', 'c'], ())
 
@@ -440,7 +440,7 @@ def test_recording_of_few_samples_is_excluded_alone() -> None:
     (one, both) = (movement_sums(o, ()) for o in ([full], [poor, full]))
     assert both.squared == one.squared > 0.0
     np.testing.assert_array_equal(both.cross, one.cross)
-    np.testing.assert_array_equal(both.own, one.own)
+    np.testing.assert_array_equal(both.load_products, one.load_products)
     volts[60:80] = full.volts[60:80]
     assert movement_sums([dataclasses.replace(full, volts=volts), full], ()).squared > one.squared
     # Sums over the blocks of what the dots moved about their mean, m^2.
@@ -455,7 +455,7 @@ def test_recording_of_few_samples_is_excluded_alone() -> None:
         only[:, k] = full.loads[:, k]
         moved = ForwardModel(RIG, []).run(only).dots.T.reshape(60, 20, 4).mean(axis=1)
         moved -= moved.mean(axis=0)
-        assert one.own[k, k] == pytest.approx(float((moved**2).sum()), rel=1e-2)
+        assert one.load_products[k, k] == pytest.approx(float((moved**2).sum()), rel=1e-2)
         np.testing.assert_allclose(
             np.diag(one.cross[k]).sum(), float((moved * (blocks - blocks.mean(axis=0))).sum()), rtol=2e-2
         )

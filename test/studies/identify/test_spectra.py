@@ -105,7 +105,7 @@ def test_band_above_fast_mode_has_no_random_walk() -> None:
     """The whole spectrum then stands for the noise."""
     samples = np.random.default_rng(9).normal(0.0, 2e-6, 20_000)
     found = spectra.coloured_noise(samples, RATE, [185.0])
-    assert found.walk == 0.0
+    assert found.random_walk == 0.0
     assert found.white == pytest.approx(2.0 * 2e-6**2 / RATE, rel=0.05)
 
 

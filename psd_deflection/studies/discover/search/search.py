@@ -22,14 +22,14 @@ from psd_deflection.studies.discover.search.trials import (
     STANDS_IN,
     Limit,
     Trials,
-    beyond,
-    counted,
-    far,
+    effect_count,
     further_terms,
+    is_far_off,
     key_of,
     slot,
     unbound,
     wald_chi_square,
+    words_of_terms,
 )
 
 LIKELY = 0.3
@@ -78,7 +78,7 @@ def _delays_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score])
     if alone is None or not trials.passes(null, alone, null):
         return None
     both = _effect_beside_delays(trials, alone, trials.screen)
-    if far(alone) and not _nearly_all(trials, null, both) and alone.chi2 < MOST_CLOSED * null.chi2:
+    if is_far_off(alone) and not _nearly_all(trials, null, both) and alone.chi2 < MOST_CLOSED * null.chi2:
         # Late loads hide the spectral lines of a small effect, and change its signature.
         both = _effect_beside_delays(trials, alone, trials.screen_beside(alone))
     return both if both is not None and trials.passes(alone, both, null) else None
@@ -102,7 +102,7 @@ def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[A
             start = ActiveEffect(start.effect, {'error': HALVED})
         if s.gain > LIKELY * best:
             starts.append([start])
-        if name == 'sample_rate' and far(null):
+        if name == 'sample_rate' and is_far_off(null):
             # A linear step does not reach another frequency of the ringing.
             starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
     return starts + _frequency_starts(trials, null, [s for s in scores if s.gain > RINGS * best])
@@ -120,7 +120,7 @@ def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> lis
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
     """Return the best start for another natural frequency: from far away a linear step does not reach it."""
     start = score.candidate.from_coefficients(score.coefficients)
-    starts = OTHER_FREQUENCIES if far(beside) else ()
+    starts = OTHER_FREQUENCIES if is_far_off(beside) else ()
     return min(
         [start, *(ActiveEffect(start.effect, {'error': v}) for v in starts)],
         key=lambda a: ws.loss(ws.residual([*ws.base, *beside.coefficients_with_nuisance, a])[0]),
@@ -246,7 +246,7 @@ class Search(Trials):
             return ()
 
         terms = further_terms(self.screen, current, self.may_pass, self.workspace.first)
-        return (Limit(self._stopped, beyond(self.workspace, current, terms)),) if terms is not None else ()
+        return (Limit(self._stopped, words_of_terms(self.workspace, current, terms)),) if terms is not None else ()
 
     def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """Return the fit of no effect, and ``current`` with all that passes added."""
@@ -254,7 +254,7 @@ class Search(Trials):
         while True:
             self._stopped = ''
             if self.spent >= self.budget_of(current):
-                self._stopped = f'{self.budget_of(current)} simulations for {counted(current)}'
+                self._stopped = f'{self.budget_of(current)} simulations for {effect_count(current)}'
                 break
             better = self._added(null, current)
             if better is None and self._looks_closer(current):
@@ -266,7 +266,7 @@ class Search(Trials):
                 renoised = True
                 current = self.renoise(current)
                 null = refit(self.workspace, ())
-            if (far(current) or self.workspace.open_level) and self.spent < self.budget_of(current):
+            if (is_far_off(current) or self.workspace.open_level) and self.spent < self.budget_of(current):
                 self._screen_anew(current)
             if len(current.effects) == 2 and self.spent < self.budget_of(current):
                 current = self._try_pairs(null, current)
@@ -306,7 +306,7 @@ class Search(Trials):
                 self.log('adding ' + better.effects[-1].label)
                 return better
             self._stopped = (
-                f'{better.effects[-1].effect.name} beside {counted(current)} explains less than '
+                f'{better.effects[-1].effect.name} beside {effect_count(current)} explains less than '
                 f'{STANDS_IN:.0%} of what remains: it may only stand in for what the library lacks'
             )
         # Of two causes of a rough machine neither may help alone, and a wrong first effect hides a pair.
@@ -447,7 +447,7 @@ class Search(Trials):
         best: dict[str, Score] = {}
         for s in self.screen.score(without.residual, unbound(without)):
             name = s.candidate.effect.name
-            least = RINGS * gain if name in RINGING and far(without) else bar
+            least = RINGS * gain if name in RINGING and is_far_off(without) else bar
             if name not in taken and s.gain >= least:
                 best.setdefault(name, s)
         return sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.budget_of(current) else 2]

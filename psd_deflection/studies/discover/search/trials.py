@@ -25,10 +25,14 @@ MOST_TERMS = 20
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """``limit``: what ended the search, in words. ``beyond``: what more of it would give, in words."""
+    """``limit``: what ended the search, in words. ``further``: what more of it would give, in words."""
 
     limit: str
-    beyond: str
+    further: str
+
+    def tree(self) -> dict[str, str]:
+        """For JSON."""
+        return {'limit': self.limit, 'beyond': self.further}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ def further_terms(
     return Terms(names, np.column_stack(columns)) if names else None
 
 
-def beyond(workspace: Comparison, fit: Fit, terms: Terms) -> str:
+def words_of_terms(workspace: Comparison, fit: Fit, terms: Terms) -> str:
     """What ``terms`` beside ``fit`` would give on unseen load cases, in words."""
     gap = unseen_gap(workspace, fit, terms.columns)
     now = workspace.gap(fit.difference)
@@ -140,13 +144,13 @@ def wald_chi_square(workspace: Comparison, fit: Fit, index: int) -> float:
     return float(apart @ np.linalg.pinv(fit.covariance()[np.ix_(sizes, sizes)], hermitian=True) @ apart)
 
 
-def counted(fit: Fit) -> str:
+def effect_count(fit: Fit) -> str:
     """How many effects ``fit`` has, in words."""
     count = len(fit.effects)
     return f'{count} effect{"" if count == 1 else "s"}'
 
 
-def far(fit: Fit) -> bool:
+def is_far_off(fit: Fit) -> bool:
     """Return whether ``fit`` leaves so much that small signatures beside it would mislead."""
     return fit.chi2 > FAR * fit.residual.size
 
@@ -241,7 +245,7 @@ class Trials:
     def _elsewhere(self, fit: Fit, iterations: int) -> Fit:
         """``fit``, or a better one from elsewhere: a link that rings on cannot be reached from one that does not."""
         ws = self.workspace
-        if not far(fit):
+        if not is_far_off(fit):
             return fit
         starts = [
             [ActiveEffect(a.effect, {**a.values, p.name: value}) if a is moved else a for a in fit.effects]
