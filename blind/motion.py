@@ -185,8 +185,8 @@ class Result:
     """Of B blocks in motion; (B, 3) unless said otherwise. ``velocity``, ``velocity_sd``: error of the velocity at the
     end of a block, and the standard deviation that it is given. ``smoothed``: error of the best Savitzky-Golay filter
     in the middle. ``squares``: NIS of a block. ``predicted``, ``held`` (20 B, 3): error of the pose at each sample
-    until the next block is there. ``pose``, ``pose_sd``. ``unseen``: error of the pose 100 ms after the block if no more
-    samples come, in standard deviations; NaN in the last five."""
+    until the next block is there. ``pose``, ``pose_sd``. ``unseen``: error of the pose 100 ms after the block if no
+    more samples come, in standard deviations; NaN in the last five."""
 
     velocity: Array
     velocity_sd: Array
