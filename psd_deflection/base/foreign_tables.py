@@ -67,7 +67,7 @@ SLOWEST, FASTEST = 5.0, 20_000.0
 class Meant(NamedTuple):
     """A column as it is called and what it is called here; ``unit``: what to do with its numbers, in words."""
 
-    found: str
+    name: str
     ours: str
     unit: str
 
@@ -223,12 +223,12 @@ def what_of_header(
         words += f'; it has {sanitize(",".join(names), LONGEST_HEADER)}'
     guesses = meant([name for name in names if name not in known], lacking)
     if guesses:
-        reported = ', '.join(f'{m.ours} for {sanitize(m.found, 30)}{f" ({m.unit})" if m.unit else ""}' for m in guesses)
+        reported = ', '.join(f'{m.ours} for {sanitize(m.name, 30)}{f" ({m.unit})" if m.unit else ""}' for m in guesses)
         words += f'; did you mean {reported}?'
     if len(guesses) == len(lacking):
-        ours = {m.found: m.ours for m in guesses}
+        ours = {m.name: m.ours for m in guesses}
         header = ','.join(ours.get(name, name) for name in names)
-        scaled = [(names.index(m.found), m.unit.rpartition(' ')[2]) for m in guesses if m.unit]
+        scaled = [(names.index(m.name), m.unit.rpartition(' ')[2]) for m in guesses if m.unit]
         if re.fullmatch(r'[\w., -]+', header):
             cells = ''.join(f' ${i + 1} = sprintf("%.9f", ${i + 1} / {by});' for i, by in scaled)
             awk = f'awk -F, -v OFS=, \'NR == 1 {{$0 = "{header}"}} NR > 1 && NF {{{cells.strip()}}} 1\''

@@ -124,12 +124,12 @@ def _cell(value: object) -> str:
     return html.escape(sanitize(str(value), LONGEST_CELL))
 
 
-def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """``rows`` (the first is the head) as text: the first ``left`` columns flush left, the rest right."""
+def columns(rows: Sequence[Sequence[str]], align_left: int = 1) -> str:
+    """``rows`` (the first is the head) as text: the first ``align_left`` columns flush left, the rest right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = []
     for row in rows:
-        cells = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        cells = [c.ljust(w) if i < align_left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
         lines.append('  '.join(cells).rstrip())
     lines.insert(1, '  '.join('-' * w for w in widths))
     return '\n'.join(lines)

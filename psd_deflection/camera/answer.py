@@ -49,7 +49,7 @@ class TargetPose(NamedTuple):
     ``points`` (n, 2): pixels of what was found (centres of discs, corners). ``blur``: length of the motion blur, px.
     ``scale``: apparent radius of the discs, in units of what the spacing makes it (1.0 for other targets).
     ``noise``: rms of the residuals, grey levels or px. ``planar``: the distance is not known (no camera matrix).
-    ``misfit``: difference between picture and model beyond noise, rms in units of the contrast.
+    ``model_error``: difference between picture and model beyond noise, rms in units of the contrast.
     ``keystone`` (0 or 2): perspective of a lens that is not known, 1/m: a point (x, y) of the target is 1 + keystone
     (x, y) times as far as the rotation says.
     """
@@ -64,7 +64,7 @@ class TargetPose(NamedTuple):
     scale: float = 1.0
     noise: float = 0.0
     planar: bool = False
-    misfit: float = 0.0
+    model_error: float = 0.0
     keystone: FloatArray = np.zeros(0)
 
     @property

@@ -348,7 +348,7 @@ class Charuco(Board):
     """A chessboard with a marker in each white square."""
 
     kind = 'charuco'
-    own = ('columns', 'rows', 'square', 'marker', 'dictionary')
+    fields = ('columns', 'rows', 'square', 'marker', 'dictionary')
     usual, usual_dictionary = (7, 9), 'DICT_4X4_100'
     crossings = True
 
@@ -394,7 +394,7 @@ class AprilTags(Board):
     """A grid of tags."""
 
     kind = 'apriltag'
-    own = ('columns', 'rows', 'marker', 'gap', 'dictionary')
+    fields = ('columns', 'rows', 'marker', 'gap', 'dictionary')
     usual, usual_dictionary = (4, 6), 'DICT_APRILTAG_36h11'
     crossings = False
 

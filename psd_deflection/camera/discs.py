@@ -245,7 +245,7 @@ class Discs(Target):
     """Finds and fits the three discs, frame by frame. What it remembers: which end of the line was up, and the rest."""
 
     kind = 'circles'
-    own = ('spacing', 'radius')
+    fields = ('spacing', 'radius')
 
     @classmethod
     def check(cls, settings: CameraSettings) -> None:
@@ -259,7 +259,7 @@ class Discs(Target):
         self._spacing, self._radius = settings.spacing, settings.radius
         self._towards = -1.0 if settings.view == 'outside' else 1.0
         self._centres = np.array([[0.0, settings.spacing], [0.0, 0.0], [0.0, -settings.spacing]])
-        self._up = np.array([math.sin(settings.turn), -math.cos(settings.turn)])
+        self._up = np.array([math.sin(settings.rotation), -math.cos(settings.rotation)])
         self._answered = False
         self._plate: FloatArray | None = None
         self._fitter: Fitter | None = None

@@ -40,7 +40,7 @@ class CameraReference:
         return self._rest
 
     @property
-    def turn(self) -> float:
+    def rotation(self) -> float:
         """How far the image of the plate at rest is turned clockwise, rad; NaN before the rest is known."""
         if self._rest is None:
             return math.nan

@@ -32,7 +32,7 @@ class Refined(NamedTuple):
 
     pixels: FloatArray
     blur: FloatArray
-    misfit: FloatArray
+    rms: FloatArray
 
 
 def refined(image: Any, pixels: FloatArray, edges: FloatArray, reach: float, crossing: bool) -> Refined:

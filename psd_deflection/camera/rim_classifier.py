@@ -103,7 +103,7 @@ class RimClassifier:
         relative = raw / float(contrast.mean())
         if motion > _DOUBLED_FROM * max(sharp, 0.5) and _doubled(normal, relative, shape.blur):
             raise NoPoseError(Status.GHOST)
-        misfit = _misfit(normal.z, relative, sector, rims, full_scale)
+        misfit = _model_error(normal.z, relative, sector, rims, full_scale)
         if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
             raise NoPoseError(Status.MISFIT)
         # What the model does not say: a level that is off by the misfit moves the rim by that over the steepest rise.
@@ -146,7 +146,7 @@ class RimClassifier:
             shape.swell,
             noise,
             planar=not self._lens.known,
-            misfit=misfit,
+            model_error=misfit,
             keystone=shape.keystone,
         )
 
@@ -159,7 +159,7 @@ class RimClassifier:
         return out
 
 
-def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: float) -> float:
+def _model_error(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: float) -> float:
     """How far the picture is from the model beyond noise, rms in units of the contrast, as ``raw`` is.
 
     Pixels are taken together by sector and by their distance from the rim. What all sectors have in common is the

@@ -67,7 +67,7 @@ class CameraSettings:
     view: str = parameter(
         'outside', '', 'from where the camera sees the plate', name='camera.view', choices=VIEWS, live=True
     )
-    turn: float = parameter(
+    rotation: float = parameter(
         0.0,
         'rad',
         'about how far the image of the plate is turned clockwise',

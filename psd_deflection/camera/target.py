@@ -23,11 +23,11 @@ class Drawing(NamedTuple):
 class Target(abc.ABC):
     """One kind of target, with the sizes that the settings say.
 
-    ``kind``: its name, as ``target.kind`` has it. ``own``: the fields of the settings that are its own.
+    ``kind``: its name, as ``target.kind`` has it. ``fields``: the fields of the settings that are its own.
     """
 
     kind: ClassVar[str]
-    own: ClassVar[tuple[str, ...]]
+    fields: ClassVar[tuple[str, ...]]
 
     def __init__(self, settings: CameraSettings) -> None:
         self.settings = settings
@@ -56,7 +56,7 @@ class Target(abc.ABC):
     def describe(self) -> list[str]:
         """Return the lines of ``CAMERA.yaml`` that describe it."""
         lines = [
-            f'{SETTINGS.parameters[name].name}: {_setting_words(getattr(self.settings, name))}' for name in self.own
+            f'{SETTINGS.parameters[name].name}: {_setting_words(getattr(self.settings, name))}' for name in self.fields
         ]
         return [f'target.kind: {self.kind}', *lines]
 

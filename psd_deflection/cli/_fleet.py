@@ -170,7 +170,7 @@ def notify_each(
             (_short(name), *(line(found[name]) if name in found else ('failed', *[''] * (len(head) - 1))))
             for name in names
         ]
-        show_text(columns([('recording', *head), *lines], left=2))
+        show_text(columns([('recording', *head), *lines], align_left=2))
         show(*(f'failed: {error}' for error in failed.values())) if failed else None
         if args.out is not None:
             show(f'written to {args.out}')

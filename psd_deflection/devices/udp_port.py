@@ -129,7 +129,7 @@ class UdpPort(OpenPort):
         pending, self._pending = self._pending, b''
         if pending:
             self._send(pending)
-        return candidate.kept
+        return candidate.last_bytes
 
     def _candidate(self, sender: Any) -> _Candidate:
         """What is known of somebody who may be the sender."""
@@ -195,15 +195,15 @@ class UdpPort(OpenPort):
 
 
 class _Candidate:
-    """Somebody who may be the sender. ``kept``: the last bytes that it sent."""
+    """Somebody who may be the sender. ``last_bytes``: those that it sent."""
 
     def __init__(self, validator: Validator) -> None:
-        self.kept = b''
+        self.last_bytes = b''
         self._validator = validator
 
     def takes(self, datagram: bytes) -> bool:
         """Whether it is the device's protocol, with ``datagram``."""
-        self.kept = (self.kept + datagram)[-max(KEPT, len(datagram)) :]
+        self.last_bytes = (self.last_bytes + datagram)[-max(KEPT, len(datagram)) :]
         return self._validator(datagram)
 
 

@@ -56,7 +56,7 @@ class RecordedVibration:
             places = block.seq - segment * SEGMENT_BLOCKS * self._size
             self._samples.append((places, self._calibration.dots(volts), sums * self._volt))
 
-    def found(self) -> dict[str, Any] | None:
+    def tree(self) -> dict[str, Any] | None:
         """After the last block: ``rms_m`` of the reading that the strongest vibration moves most, ``hz`` of it, and the
         ``share`` of the seconds in which something vibrates; None if nothing does.
         """
@@ -189,7 +189,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'squeezed': sum(int(n) for _, n in _values_of(recording, CLOCK_SQUEEZED)),
         'flagged': counted.flagged,
         'sample_rate_hz': counted.rate_hz,
-        'vibration': counted.vibration.found() if counted.vibration is not None else None,
+        'vibration': counted.vibration.tree() if counted.vibration is not None else None,
         'blocks': counted.blocks,
         'block_size': recording.block_size,
         'topics': topics,

@@ -53,12 +53,12 @@ class TimeShift(NamedTuple):
 
 
 def time_shift(
-    first: FloatArray, second: FloatArray, period: float, reach: float, stated: float = 0.0, *, beyond: bool = True
+    first: FloatArray, second: FloatArray, period: float, reach: float, stated: float = 0.0, *, outside: bool = True
 ) -> TimeShift:
     """Return by how much ``second`` (n, q) is later than ``first`` (n, p): rows ``period`` s apart, NaN if lost.
 
     ``reach``: the largest shift of either sign, s; of a short recording a third of its length. ``stated``: what the
-    shift is expected to be, s. ``beyond``: whether it may be larger than ``reach``.
+    shift is expected to be, s. ``outside``: whether it may be larger than ``reach``.
     """
     finer = int(np.ceil(0.99 * period / STEP_S))
     rows = int(MOST_VALUES * STEP_S / period)
@@ -100,7 +100,7 @@ def time_shift(
     apart = np.count_nonzero(np.diff(possible.astype(np.int8)) == 1) > 1
     if possible[0] or possible[-1] or apart:
         return TimeShift(0.0, 0.0, unknown=REPEATS)
-    if beyond and _better_elsewhere(a, b, int(near[at]), step, int(possible.sum())):
+    if outside and _better_elsewhere(a, b, int(near[at]), step, int(possible.sum())):
         return TimeShift(0.0, 0.0, unknown=REPEATS)
     # Squares of what is unshared, in units of their noise, are a parabola about the shift.
     before, here, after = fine[at - 1 : at + 2] / fine[at] @ values

@@ -209,7 +209,7 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
         found = []
         for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             middle = 0.5 * (begin + end)
-            piece = _shift(ours, theirs, begin, end, clock, NEAR_S + DRIFT * abs(middle - clock.at), beyond=False)
+            piece = _shift(ours, theirs, begin, end, clock, NEAR_S + DRIFT * abs(middle - clock.at), outside=False)
             if not piece.unknown:
                 found.append((middle, piece.seconds, piece.sd))
         if len(found) < 2:
@@ -227,20 +227,20 @@ def _shift(
     clock: ClockOffset,
     reach: float,
     *,
-    beyond: bool = True,
+    outside: bool = True,
 ) -> TimeShift:
     """What the second clock shows more than ``clock`` says, from the motion from ``begin`` to ``end`` of the first.
 
-    ``beyond``: as :func:`time_shift` has it.
+    ``outside``: as :func:`time_shift` has it.
     """
     grid = np.arange(begin, end, min(ours.period, theirs.period))
     first, second = ours.at(grid), theirs.at(clock.on_second(grid))
-    found = time_shift(first, second, float(grid[1] - grid[0]), reach, beyond=beyond)
+    found = time_shift(first, second, float(grid[1] - grid[0]), reach, outside=outside)
     if found.unknown or reach < NEAR_S:
         return found
     # What is left is no part of a sample, which the interpolation would bias.
     nearer = clock._replace(seconds=clock.seconds + found.seconds)
-    near = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S, beyond=False)
+    near = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S, outside=False)
     return near if near.unknown else near._replace(seconds=found.seconds + near.seconds)
 
 

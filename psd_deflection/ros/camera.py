@@ -144,7 +144,7 @@ class CameraNode(BaseNode[CameraSettings]):
             names = (('sd dx (m)', 0), ('sd dy (m)', 1), ('sd theta (rad)', 2))
             values += [(name, f'{math.sqrt(float(self._last.covariance[i, i])):.3g}') for name, i in names]
         if self._reference is not None and self._reference.rest is not None:
-            values.append(('turn of the camera (rad)', f'{self._reference.turn:.6f}'))
+            values.append(('turn of the camera (rad)', f'{self._reference.rotation:.6f}'))
         worst = since.most_common(1)
         if not frames:
             waits = self._reference is not None and self._reference.rest is None

@@ -163,7 +163,7 @@ class ChainNode(BaseNode[ChainSettings]):
 
     def _joints(self, message: Any) -> None:
         if self.chain is not None:
-            self.chain.turn(dict(zip(message.name, message.position, strict=False)))
+            self.chain.set_angles(dict(zip(message.name, message.position, strict=False)))
 
     def _zero(self, chain: ChainSession) -> Zeroed:
         taken = chain.zero()

@@ -187,7 +187,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         Raises DeviceError, and stays active, if they are not there after ``RELEASE_S``.
         """
         self._come_to_rest()
-        if self.command.sends and (left := self._left()):
+        if self.command.sends and (left := self._remaining_offset()):
             self._release_until = math.inf
             raise DeviceError(
                 f'{left} is left after {RELEASE_S:g} s ({self.command.text}, max_rate = {self.settings.max_rate:g}): '
@@ -222,15 +222,15 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._ended.set()
         self._sender.join()
         self._sender = None
-        if left := self._left():
+        if left := self._remaining_offset():
             self.log(f'{left} is left with the controller: {self.command.text}', WARNING)
 
-    def _left(self) -> str:
+    def _remaining_offset(self) -> str:
         """The largest offset that the controller may still have, in words; '' if it has none."""
         if not self._drive:
             return ''
         with self._lock:
-            left = self.command.offsets if self._failed is not None else self.compensator.left
+            left = self.command.offsets if self._failed is not None else self.compensator.remaining_offsets
         worst = int(np.abs(left).argmax())
         return f'an offset of {left[worst]:.3g} at {self._names[worst]}' if left[worst] else ''
 

@@ -45,7 +45,7 @@ def ros(name: str, arguments: Sequence[str], shared_memory: bool = False) -> Ite
         finally:
             rclpy.try_shutdown()
     finally:
-        signals.restore()
+        signals.restore_handlers()
 
 
 @contextlib.contextmanager

@@ -158,7 +158,7 @@ class ChainSession:
                 names.append(f'{self.file.names[link]}: {(self.reasons[link] or "no estimate") if heard else away}')
         return '; '.join(names)
 
-    def turn(self, angles: Mapping[str, float]) -> None:
+    def set_angles(self, angles: Mapping[str, float]) -> None:
         """Take the angles (rad) of joints by their names; names that the chain does not have are passed over."""
         self._angles = tuple(
             angles.get(joint.name, now) if joint.name else now

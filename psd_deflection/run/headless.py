@@ -79,7 +79,7 @@ def run_until_signal(
     except StopRequestedError:
         return 0
     finally:
-        signals.restore()
+        signals.restore_handlers()
 
 
 def _run_until(

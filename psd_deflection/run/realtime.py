@@ -203,7 +203,7 @@ class Signals:
         finally:
             self._raise = False
 
-    def restore(self) -> None:
+    def restore_handlers(self) -> None:
         """Restore the previous signal handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)

@@ -194,7 +194,7 @@ def test_corners_of_the_model_are_found_exactly(crossing: bool, sharp: float, of
         return
     assert found.pixels[:2] == pytest.approx(true[:2], abs=1e-4)
     assert found.blur[:2] == pytest.approx(np.tile(blur, (2, 1)), abs=1e-3)
-    assert found.misfit[:2] == pytest.approx(0.0, abs=1e-4)
+    assert found.rms[:2] == pytest.approx(0.0, abs=1e-4)
 
 
 def discs_at(*places: tuple[float, float, float, float]) -> Any:

@@ -72,7 +72,7 @@ def test_a_target_describes_itself_by_its_own_settings(kind: str) -> None:
     target = target_of(settings_of(kind))
     assert target.kind == kind
     names = [line.split(':')[0] for line in target.describe()]
-    assert names == ['target.kind', *(SETTINGS.parameters[own].name for own in target.own)]
+    assert names == ['target.kind', *(SETTINGS.parameters[own].name for own in target.fields)]
     assert all(name.startswith('target.') for name in names)
     # They make the same target again, and each of them is a setting that somebody has.
     values = dict(line.split(': ') for line in target.describe())
@@ -87,7 +87,7 @@ def _numbers(values: dict[str, str]) -> dict[str, object]:
 
 
 def test_every_size_in_the_settings_is_of_some_kind() -> None:
-    own = {f'{SETTINGS.parameters[name].name}' for kind in TARGETS for name in target_class(kind).own}
+    own = {f'{SETTINGS.parameters[name].name}' for kind in TARGETS for name in target_class(kind).fields}
     sizes = {p.name for p in SETTINGS.parameters.values() if p.name.startswith('target.')}
     assert sizes - own == {'target.kind'}
     # Each of them may be set while the node runs.

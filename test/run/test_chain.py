@@ -148,7 +148,7 @@ def test_a_turned_joint_counts_from_the_next_time_on(
     one = running.until(lambda c: c.end is not None)
     assert one.end is not None
     assert one.end.rigid.position == pytest.approx([0.0, 0.0, 1.27])
-    running.chain.turn({'shoulder': np.pi / 2, 'wrist': 1.0})
+    running.chain.set_angles({'shoulder': np.pi / 2, 'wrist': 1.0})
     assert running.chain.angles == (np.pi / 2, 0.0)
     running.send(devices, sample, 200)
     two = running.until(lambda c: c.end is not None and c.end.angles[0] > 0.0)

@@ -282,7 +282,7 @@ def test_what_runs_is_not_torn() -> None:
         with pytest.raises(StopRequestedError):
             signals.interruptible(lambda: None)
     finally:
-        signals.restore()
+        signals.restore_handlers()
 
 
 def test_a_hang_up_that_is_to_be_passed_over_is() -> None:
@@ -292,7 +292,7 @@ def test_a_hang_up_that_is_to_be_passed_over_is() -> None:
         signals = Signals()
         os.kill(os.getpid(), signal.SIGHUP)
         assert not signals.stop
-        signals.restore()
+        signals.restore_handlers()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

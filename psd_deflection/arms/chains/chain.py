@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psd_deflection.arms.chains.transform import IDENTITY, Transform, cross_matrix, shift, turn
+from psd_deflection.arms.chains.transform import IDENTITY, Transform, cross_matrix, rotation_about, shift
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.records import DeflectionEstimate, FloatArray
@@ -72,7 +72,7 @@ class ChainLink:
 
     def base(self, angle: float) -> Transform:
         """``link_base`` in the tip frame of the link before, at this angle of the joint, rad."""
-        return self.mount @ turn(self.axis, angle) if angle else self.mount
+        return self.mount @ rotation_about(self.axis, angle) if angle else self.mount
 
 
 class TipDeflection(NamedTuple):

@@ -45,7 +45,7 @@ def of_position_and_angles(xyz: FloatArray, rpy: FloatArray) -> Transform:
     return Transform(Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, dtype=np.float64))
 
 
-def turn(axis: FloatArray, angle: float) -> Transform:
+def rotation_about(axis: FloatArray, angle: float) -> Transform:
     """A rotation by ``angle`` (rad) about the unit vector ``axis``."""
     return Transform(Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix(), np.zeros(3))
 

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_position_and_angles, turn
+from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_position_and_angles, rotation_about
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import text_of_file
 from psd_deflection.base.text import did_you_mean, plain_number
@@ -44,7 +44,7 @@ class ArmJoint:
         """The link behind the joint in the link before it."""
         if self.kind == 'prismatic':
             return self.origin @ Transform(np.eye(3), self.axis * q)
-        return self.origin @ turn(self.axis, q)
+        return self.origin @ rotation_about(self.axis, q)
 
 
 class Arm:

@@ -160,13 +160,13 @@ class Compensator:
         return self.settings.output == COMMANDS
 
     @property
-    def left(self) -> FloatArray:
+    def remaining_offsets(self) -> FloatArray:
         """(n,): the offsets that the controller may still have, as far as one knows, rad or m."""
         if self._speaks or self._has is None:
             return self._offsets.copy()
-        return self._kept() if self._sums else self._has.copy()
+        return self._offsets_of_command() if self._sums else self._has.copy()
 
-    def _kept(self) -> FloatArray:
+    def _offsets_of_command(self) -> FloatArray:
         """Output of commands, while nothing is sent: the offsets that the command of the controller still has from us.
 
         Zeros if that command is not between what we sent last and the pose without offsets: somebody else's.
@@ -185,7 +185,7 @@ class Compensator:
     @property
     def owed(self) -> bool:
         """Whether offsets that the controller has are to be taken back as soon as it tells them."""
-        return self._owed and not self._speaks and bool(np.any(self.left))
+        return self._owed and not self._speaks and bool(np.any(self.remaining_offsets))
 
     def controller_text(self, now: float) -> str:
         """What the controller tells that it has, rad or m, in words."""
@@ -340,7 +340,7 @@ class Compensator:
         if self._speaks or self._dry or self._has is None or (now - self._has_t > FOREIGN_S and not self._sums):
             return ''
         if self._sums:
-            kept = self._kept()
+            kept = self._offsets_of_command()
             worst = int(np.abs(kept).argmax())
             what = f'the command of the controller keeps {kept[worst]:.3g} from here at {self.arm.names[worst]}'
             return f'{what}: {self._unready}' if kept[worst] else ''
@@ -363,7 +363,7 @@ class Compensator:
             if abs(has[worst]) > settings.max_offset:
                 return f'the controller applies {has[worst]:.3g} at {self.arm.names[worst]}: beyond max_offset'
         elif has is not None and known:
-            offsets = self._kept()
+            offsets = self._offsets_of_command()
             pose, away = has - offsets, np.abs(has - self._joints) if self._joints is not None else np.zeros(len(has))
             worst = int(away.argmax())
             if away[worst] > settings.follow_error:

@@ -80,13 +80,13 @@ class _Scratch:
         self._both = 2 * self._half
         self._first = rest = np.empty((self._half, *shape[1:]))
         self._odd = rest[0, ...] if count & 1 else None
-        self._turns: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self._steps: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         while (count := len(rest)) > 1:
             half = count // 2
             pairs = np.empty((half, *shape[1:]))
-            self._turns.append((rest[:half], rest[half : 2 * half], pairs))
+            self._steps.append((rest[:half], rest[half : 2 * half], pairs))
             if count & 1:
-                self._turns.append((pairs[0, ...], rest[-1, ...], pairs[0, ...]))
+                self._steps.append((pairs[0, ...], rest[-1, ...], pairs[0, ...]))
             rest = pairs
         self._last = rest[0, ...]
 
@@ -96,7 +96,7 @@ class _Scratch:
         np.add(rows[:half], rows[half:both], self._first)
         if self._odd is not None:
             np.add(self._odd, rows[-1], self._odd)
-        for a, b, pairs in self._turns:
+        for a, b, pairs in self._steps:
             np.add(a, b, pairs)
         return self._last.copy()
 

@@ -239,7 +239,7 @@ def _report(
                 'answers': good,
                 'rejected': rejected,
                 'sd': dict(zip(('dx', 'dy', 'theta'), median, strict=False)),
-                'turn': None if rest is None else reference.turn,
+                'turn': None if rest is None else reference.rotation,
                 'radius_scale': None if rest is None else rest.scale,
                 'lens': bool(settings.matrix),
             }
@@ -252,7 +252,7 @@ def _report(
         dx, dy, theta = median
         sds = f'ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}°'
         show(f'one sd, median of the last frames: {sds}')
-        show(f'the camera is turned by {math.degrees(reference.turn):+.3f}° in its plane, which is taken off')
+        show(f'the camera is turned by {math.degrees(reference.rotation):+.3f}° in its plane, which is taken off')
         show(*reference.target.rest_words(rest))
     if not settings.matrix:
         warn(

@@ -36,7 +36,7 @@ def opened_recording(args: argparse.Namespace) -> Opened:
     return opened(args.recording, args.params_file, namespace=args.namespace, span=args.span, notify=warn)
 
 
-def counted(args: argparse.Namespace) -> Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]:
+def progress(args: argparse.Namespace) -> Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]:
     """Hands blocks on below a progress bar."""
     return lambda blocks: progress_of(blocks, quiet=args.json)
 

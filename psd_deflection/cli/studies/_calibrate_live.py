@@ -76,7 +76,7 @@ def _followed(args: argparse.Namespace, asked: CalibrationOptions, daemon: Daemo
     def still() -> bool:
         if signals.stop:
             # A second one ends at once, with the last answer.
-            signals.restore()
+            signals.restore_handlers()
             return False
         try:
             return recording_of(daemon) == str(folder)
@@ -93,7 +93,7 @@ def _followed(args: argparse.Namespace, asked: CalibrationOptions, daemon: Daemo
     except KeyboardInterrupt:
         pass
     finally:
-        signals.restore()
+        signals.restore_handlers()
     display.end()
     if last is None or last.answer is None:
         why = f': {last.words}' if last is not None else ''

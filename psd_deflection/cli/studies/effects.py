@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         print_json({e.name: as_json(e) for e in shown}, indent=2)
     elif args.effect is None:
         rows = [('effect', 'stage', 'what it does'), *((e.name, e.stage, e.summary) for e in shown)]
-        show_text(columns(rows, left=3))
+        show_text(columns(rows, align_left=3))
         show('', f'in the order in which they act: {", ".join(STAGES)}; psd-deflection effects NAME explains one')
     else:
         show(*explained(shown[0]))

@@ -15,7 +15,7 @@ rig.yaml with the modes in it.
 import argparse
 
 from psd_deflection.cli._progress import stage
-from psd_deflection.cli.studies._answer import answer, answer_arguments, counted, opened_recording, recording_arguments
+from psd_deflection.cli.studies._answer import answer, answer_arguments, opened_recording, progress, recording_arguments
 from psd_deflection.studies.identify.from_recordings import read_identify
 from psd_deflection.studies.identify.identify import identify
 
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Identify."""
-    problem = read_identify(opened_recording(args), counted(args))
+    problem = read_identify(opened_recording(args), progress(args))
     with stage('looking for modes', quiet=args.json):
         found = identify(problem)
     return answer(args, found)

@@ -18,7 +18,7 @@ import argparse
 
 from psd_deflection.cli._progress import stage
 from psd_deflection.cli._values import number
-from psd_deflection.cli.studies._answer import answer, answer_arguments, counted, opened_recording, recording_arguments
+from psd_deflection.cli.studies._answer import answer, answer_arguments, opened_recording, progress, recording_arguments
 from psd_deflection.model.solvers.registry import SOLVERS
 from psd_deflection.studies.validate.from_recordings import ALL, read_validate
 from psd_deflection.studies.validate.validate import validate
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         largest=args.max_offset,
         exposure=args.exposure,
         solvers=args.solver,
-        with_progress=counted(args),
+        with_progress=progress(args),
     )
     with stage('comparing', quiet=args.json):
         found = validate(problem)

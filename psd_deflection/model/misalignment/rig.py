@@ -37,7 +37,7 @@ NOT_CALIBRATED = ('none',)
 
 
 class RigVector(NamedTuple):
-    """``values`` (COUNT,). ``clamp``: compliances by name, rad/(N m). ``others``: effects that are no parameters here.
+    """``values`` (COUNT,). ``clamp``: compliances by name, rad/(N m). ``other_effects``: those that are no parameters.
 
     ``listed``: names of the effects that are. ``tilts``: whether one of them says that the plate tilts; otherwise the
     estimates are those of a plate that stays parallel, and ``values`` has the k that the link has.
@@ -45,7 +45,7 @@ class RigVector(NamedTuple):
 
     values: FloatArray
     clamp: dict[str, float]
-    others: list[ActiveEffect]
+    other_effects: list[ActiveEffect]
     listed: frozenset[str]
     tilts: bool
 
@@ -189,7 +189,7 @@ def rig_values(
     # Hardly determined, it may come out below what it can be.
     p[SLOPE] = max(p[SLOPE], BY_NAME[_SLOPE].minimum or 0.0)
     values: dict[str, object] = {'link.slope_ratio': float(p[SLOPE])}
-    effects = list(vector.others)
+    effects = list(vector.other_effects)
     for n in (1, 2):
         own = {name: float(p[INDEX[name]]) for name in INDEX if name.startswith((f'psd_{n}.', f'beam_{n}.'))}
         values[f'psd_{n}.center'] = [own[f'psd_{n}.center_x'], own[f'psd_{n}.center_y']]

@@ -42,7 +42,7 @@ def below(v: FloatArray, shapes: Values) -> FloatArray:
     return np.maximum(shapes['threshold'] - v, 0.0)
 
 
-def beyond(v: FloatArray, shapes: Values) -> FloatArray:
+def excess(v: FloatArray, shapes: Values) -> FloatArray:
     """By how much the size of v exceeds the threshold, with the sign of v."""
     return np.sign(v) * np.maximum(np.abs(v) - shapes['threshold'], 0.0)
 

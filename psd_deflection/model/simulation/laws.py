@@ -126,7 +126,7 @@ FORMS: Mapping[str, Form] = {
     'beyond': Form(
         'static',
         'sign({v}) max(|{v}| - {threshold}, 0)',
-        apart=law_forms.beyond,
+        apart=law_forms.excess,
         fitted={'threshold': ('v', *_POSITIVE)},
     ),
     'within': Form(

@@ -42,12 +42,12 @@ class ForwardModel:
     """The stages without noise and converter; keeps its state between calls.
 
     ``effects``: the active effects; by default those of the rig file. ``phase``: quantities are taken this
-    long after each sample, s. ``settled``: the link comes to rest under each load before it is read. ``ahead``: of how
+    long after each sample, s. ``steady``: the link comes to rest under each load before it is read. ``ahead``: of how
     many later samples one takes a reading; a history is then simulated at once.
     """
 
     def __init__(
-        self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0, *, settled: bool = False
+        self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0, *, steady: bool = False
     ) -> None:
         self.effects = acting(effects_of_rig(rig) if effects is None else effects)
         self.physics = Physics.of(rig)
@@ -70,7 +70,7 @@ class ForwardModel:
             Filter(bending, self._at_rest[1]),
             Filter(torsion),
         )
-        self._settled = settled
+        self._steady = steady
         self._states: list[State] = [{} for _ in self.effects]
         self._count = 0
         self._first_temperature: float | None = None
@@ -116,7 +116,7 @@ class ForwardModel:
         samples.pose = np.empty((3, n))
         for axis, mode in enumerate(self._modes):
             held = samples.static[axis] + self._at_rest[axis] if axis < 2 else samples.static[axis]
-            samples.pose[axis] = held if self._settled else mode(held)
+            samples.pose[axis] = held if self._steady else mode(held)
         self._at('pose', samples)
         samples.beams = np.repeat(p.beams.reshape(-1, 1), n, axis=1)
         self._at('beam', samples)
@@ -148,7 +148,7 @@ class ForwardModel:
             return samples.volts.copy()
         key = (before, phase)
         if key not in self._between:
-            self._between[key] = ForwardModel(self._rig, self.effects[:before], phase, settled=self._settled)
+            self._between[key] = ForwardModel(self._rig, self.effects[:before], phase, steady=self._steady)
         if key not in self._asked:
             self._asked[key] = self._between[key].run(loads, temperature).volts
         return self._asked[key].copy()

@@ -159,7 +159,7 @@ def _steps(
     beside = _BesideSamples(recording, pipeline)
     waiting: list[SampleBlock] = []
     for block in recording.blocks() if blocks is None else blocks:
-        if beside.due(block):
+        if beside.has_event(block):
             yield from _processed(pipeline, waiting)
             yield from beside.until(block)
         waiting.append(block)
@@ -213,7 +213,7 @@ class _BesideSamples:
         self._acceleration = next(self._accelerations, None)
         self._begun = False
 
-    def due(self, block: SampleBlock) -> bool:
+    def has_event(self, block: SampleBlock) -> bool:
         """Whether something takes effect before the end of ``block``."""
         first, last = block.t_ns[0], block.t_ns[-1]
         return bool(

@@ -206,14 +206,14 @@ class History:
         self._new_marks = False
         return Kept(since, cells, marks)
 
-    def restore(self, kept: Kept) -> None:
+    def load(self, saved: Kept) -> None:
         """Take what an earlier run kept: it is before what has come since, or in the same cell."""
         own = self.rings[KEPT_LEVEL].cells['key']
-        ends = [int(keys.min()) for keys in (own[own != _NONE], kept.cells['key'][-1:]) if len(keys)]
+        ends = [int(keys.min()) for keys in (own[own != _NONE], saved.cells['key'][-1:]) if len(keys)]
         self._unsaved_from = min(ends, default=0)
         for ring in self.rings[KEPT_LEVEL:]:
-            ring.put(_merged(kept.cells, ring.width_ns // self.rings[KEPT_LEVEL].width_ns))
-        marks = sorted({*(kept.marks or ()), *self.marks}, key=lambda mark: mark[0])
+            ring.put(_merged(saved.cells, ring.width_ns // self.rings[KEPT_LEVEL].width_ns))
+        marks = sorted({*(saved.marks or ()), *self.marks}, key=lambda mark: mark[0])
         self.marks.clear()
         self.marks.extend(marks)
 

@@ -70,7 +70,7 @@ class PageHistory:
         return [] if self._keeper is None else [self._keep(self._keeper)]
 
     async def _keep(self, keeper: HistoryKeeper) -> None:
-        while not keeper.restore():
+        while not keeper.load_saved():
             await asyncio.sleep(RESTORE_S)
         while True:
             await asyncio.sleep(KEEP_EVERY_S)
@@ -167,10 +167,10 @@ class HistoryKeeper:
         """Begin to read what was kept."""
         self._thread.start()
 
-    def restore(self) -> bool:
+    def load_saved(self) -> bool:
         """Give the history what was kept, once it is read; return whether that was done by now."""
         if self._loaded is not None:
-            self._history.restore(self._loaded)
+            self._history.load(self._loaded)
             self._loaded, self._restored = None, True
         return self._restored
 
@@ -196,7 +196,7 @@ class HistoryKeeper:
         until = time.monotonic() + END_S
         if not self.alive or not self._idle.wait(END_S):
             return
-        self.restore()
+        self.load_saved()
         self.save()
         if self._idle.wait(max(0.0, until - time.monotonic())):
             self._todo.put_nowait(None)

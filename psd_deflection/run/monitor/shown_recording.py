@@ -47,9 +47,9 @@ FULL_S = 0.01
 
 @dataclass(slots=True)
 class _Playhead:
-    """``due``: monotonic time of the next record, s; ``t_ns`` and ``block``: of the last one."""
+    """``next_time``: monotonic time of the next record, s; ``t_ns`` and ``block``: of the last one."""
 
-    due: float
+    next_time: float
     t_ns: int | None = None
     block: int = -1
 
@@ -299,11 +299,11 @@ class ShownRecording:
                 self._show(record, at)
             self._carry_out()
             self._seek(at)
-            while not self._stop.is_set() and not self._again and self._waits(at.due):
+            while not self._stop.is_set() and not self._again and self._waits(at.next_time):
                 self._woken.clear()
                 self._carry_out()
                 if self._paused:
-                    at.due = time.monotonic()
+                    at.next_time = time.monotonic()
             if self._stop.is_set() or self._again:
                 return
 
@@ -319,7 +319,7 @@ class ShownRecording:
                 self._start_ns = record.t_ns
             self._give_inputs(record.t_ns)
             if at.t_ns is not None:
-                at.due += min((record.t_ns - at.t_ns) / 1e9 / self._speed, LONGEST_WAIT_S)
+                at.next_time += min((record.t_ns - at.t_ns) / 1e9 / self._speed, LONGEST_WAIT_S)
                 self._lost += (record.index - at.block - 1) * self.rig.estimator.block_size
             at.t_ns, at.block = record.t_ns, record.index
             self._lost += record.lost
@@ -338,16 +338,16 @@ class ShownRecording:
                 pass
         else:
             self._goal = None
-        at.due = time.monotonic()
+        at.next_time = time.monotonic()
 
-    def _waits(self, due: float) -> bool:
-        """Wait until ``due``, or longer if paused; whether a request ended the wait, or it is paused."""
+    def _waits(self, next_time: float) -> bool:
+        """Wait until ``next_time``, or longer if paused; whether a request ended the wait, or it is paused."""
         if self._goal is not None:
             return False
         if self._paused:
             self._woken.wait()
             return True
-        return self._woken.wait(max(due - time.monotonic(), 0.0))
+        return self._woken.wait(max(next_time - time.monotonic(), 0.0))
 
     def _give_inputs(self, t_ns: int) -> None:
         while self._next_input < len(self._inputs) and self._inputs[self._next_input].t_ns <= t_ns:

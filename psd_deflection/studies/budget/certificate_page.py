@@ -109,7 +109,7 @@ class Certified(StudyResult):
 
     def lines(self) -> list[str]:
         """Return the sentences and the table of poses."""
-        return [*self.sentences(), '', *columns(self.result_rows(), left=4).splitlines()]
+        return [*self.sentences(), '', *columns(self.result_rows(), align_left=4).splitlines()]
 
     def tree(self) -> dict[str, Any]:
         """SI; (ΔX, ΔY, θ) in this order."""
@@ -279,8 +279,8 @@ def _six(value: float) -> str:
 
 
 def _table(rows: list[list[str]]) -> str:
-    head, *others = rows
-    return table(head, others)
+    head, *body = rows
+    return table(head, body)
 
 
 def _all_of(words: set[str]) -> str:
@@ -328,9 +328,9 @@ def _check(tree: Any, path: Path) -> None:
         raise ConfigError(
             f'{path}: kind = {_words(tree.get("kind"))}: its scale is traceable to nothing; calibrate with a reference'
         )
-    for name, one in _map(tree, 'parameters', path).items():
+    for name, entry in _map(tree, 'parameters', path).items():
         words = f'parameters.{_words(name)}'
-        if not isinstance(one, dict) or not all(_is_number(one.get(key)) for key in ('value', 'used')):
+        if not isinstance(entry, dict) or not all(_is_number(entry.get(key)) for key in ('value', 'used')):
             raise ConfigError(f'{path}: {words}: needs the numbers value and used; calibrate again')
     reference = _map(tree, 'reference', path)
     for key in ('rows', 'outliers'):

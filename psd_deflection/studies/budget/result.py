@@ -67,7 +67,7 @@ class Budgeted(StudyResult):
 
     def lines(self) -> list[str]:
         """Return the situation, the table of all causes, the totals."""
-        out = [self._situation(), '', *columns(self.cause_rows(), left=4).splitlines()]
+        out = [self._situation(), '', *columns(self.cause_rows(), align_left=4).splitlines()]
         out += ['', *columns(self.total_rows()).splitlines()]
         out += ['', *columns(self.expanded_rows()).splitlines()]
         if self.sampled is not None:
@@ -238,8 +238,8 @@ def parameter_rows(budget: Budget) -> list[list[str]]:
 
 
 def _split(rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-    head, *others = rows
-    return head, others
+    head, *body = rows
+    return head, body
 
 
 def display_values(values: FloatArray) -> list[str]:

@@ -133,7 +133,7 @@ def check_effects(rig: Rig) -> None:
 
     A calibration reads the detectors without it, so it would be counted twice.
     """
-    for active in vector_of_rig(rig).others:
+    for active in vector_of_rig(rig).other_effects:
         if any(part.effect.correct is not None and not part.effect.uses for part in active.parts):
             raise ConfigError(
                 f'effects: {active.label}: a calibration reads the detectors without it and would count it twice; '
@@ -195,7 +195,7 @@ def _level(runs: Sequence[CalibrationRun], rig: Rig, psd: int, lit: float | None
     if seconds < LEAST:
         sums = run.volts[:, 3 * psd + 2]
         raise RecordingError(
-            f'{", ".join(one.name for one in runs)}: the laser of psd_{psd + 1} is off for {seconds:.1f} s; '
+            f'{", ".join(r.name for r in runs)}: the laser of psd_{psd + 1} is off for {seconds:.1f} s; '
             f'a dark level needs {LEAST:g} s with sum{psd + 1} below {_limit(rig):g} V (sum_min), '
             f'and its median is {float(np.nanmedian(sums)):.3f} V'
         )

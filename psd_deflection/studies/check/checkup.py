@@ -108,7 +108,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
 
 def _simulated(rig: Rig, loads: FloatArray, *, at_rest: bool = False) -> FloatArray:
     """Dots x1 y1 x2 y2 (n, 4), m, under ``loads`` (n, 3), N, N, N m; ``at_rest``: at rest under each."""
-    return np.asarray(ForwardModel(rig, settled=at_rest).run(loads).true_dots.T)
+    return np.asarray(ForwardModel(rig, steady=at_rest).run(loads).true_dots.T)
 
 
 def block_means(samples: FloatArray, n: int) -> FloatArray:
@@ -301,10 +301,10 @@ def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str,
     # Steps hide a noise that is smaller than they are.
     hidden = [CHANNELS[c] in measured.stuck or measured.noise[c] < measured.steps[c] for c in columns]
     noise = [math.nan if unseen else measured.noise[c] for c, unseen in zip(columns, hidden, strict=True)]
-    found, right = noise_findings(rig, np.array(noise), measured.steps[columns].reshape(2, 2))
+    findings, right = noise_findings(rig, np.array(noise), measured.steps[columns].reshape(2, 2))
     steps, bits = step_findings(rig, measured.steps)
     lines |= right | bits
-    return [*found, *steps]
+    return [*findings, *steps]
 
 
 def _light(rig: Rig, measured: Levels, wiring: Wiring) -> dict[str, str]:
@@ -369,8 +369,8 @@ def _notes(problem: CheckProblem, wiring: Wiring, sizes: Sequence[float]) -> lis
             'look at shielding and ground'
         )
     per_minute = np.abs(drift) * 60e6
-    far = (per_minute > 5.0) & (np.abs(drift) > 5.0 * drift_sd)
-    if far.any() and drift_sd.max() <= SIGNIFICANT_DRIFT:
-        worst = int(np.argmax(np.where(far, per_minute, 0.0)))
+    drifting = (per_minute > 5.0) & (np.abs(drift) > 5.0 * drift_sd)
+    if drifting.any() and drift_sd.max() <= SIGNIFICANT_DRIFT:
+        worst = int(np.argmax(np.where(drifting, per_minute, 0.0)))
         out.append(f'drift: {drift[worst] * 60e6:+.1f} µm a minute on {DOTS[worst]}; let lasers and amplifier warm up')
     return out

@@ -108,7 +108,7 @@ class Isolability(StudyResult):
 
     def lines(self) -> list[str]:
         """Return the table, then the sentences."""
-        return [*columns([HEAD, *(f.row for f in self.effects)], left=5).split('\n'), '', *self.sentences()]
+        return [*columns([HEAD, *(f.row for f in self.effects)], align_left=5).split('\n'), '', *self.sentences()]
 
     def tree(self) -> dict[str, Any]:
         """Return the answer for programs; sizes in SI units."""

@@ -114,8 +114,8 @@ class Plan:
     @property
     def words(self) -> str:
         """What to do."""
-        counted = [(w, len(list(g))) for w, g in itertools.groupby(p.words for p in self.pieces)]
-        done = '; then '.join(w if times == 1 else f'{w}, {times} times' for w, times in counted)
+        repeats = [(w, len(list(g))) for w, g in itertools.groupby(p.words for p in self.pieces)]
+        done = '; then '.join(w if times == 1 else f'{w}, {times} times' for w, times in repeats)
         return f'{done}, {self.setting.words}' if self.setting.words else done
 
     @property
@@ -126,9 +126,9 @@ class Plan:
             return f'No recording within the limits would tell {self.discriminations[0].named} from {alternatives}.'
         apart = [t for t in self.discriminations if t.separable]
         least = min(max(t.separation, t.reverse) for t in apart)
-        others = ', '.join(dict.fromkeys(t.alternative for t in apart))
+        separable = ', '.join(dict.fromkeys(t.alternative for t in apart))
         out = (
-            f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {others} '
+            f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {separable} '
             f'(chi-square {least:.0f} at least, {SEPARATES:g} needed)'
         )
         lasting = [t.alternative for t in self.discriminations if not t.separable]
@@ -152,7 +152,7 @@ class Plan:
             for t in self.discriminations
         ]
         held = f'{columns(rows)}\n\n' if self.useful else ''
-        return held + columns(rows_of_alternatives, left=2)
+        return held + columns(rows_of_alternatives, align_left=2)
 
     @property
     def loads_csv(self) -> str:

@@ -282,7 +282,7 @@ class ReadingsPlant(Plant):
     def _rows(self, table: Readings, effects: Sequence[ActiveEffect], order: IntArray) -> FloatArray:
         """Return the readings (channels, n) of the rows, which are simulated in ``order``."""
         rig, warm = table.rig, table.temperature
-        model = ForwardModel(rig, sort_effects([*self.known, *effects]), settled=True)
+        model = ForwardModel(rig, sort_effects([*self.known, *effects]), steady=True)
         samples = model.expect(table.loads[order], None if warm is None else warm[order])
         dots = dots_of(rig, samples.volts)
         back = np.argsort(order)

@@ -88,7 +88,7 @@ class Validated(StudyResult):
 
     def lines(self) -> list[str]:
         """Return the sentences and the table of solvers."""
-        return [*self.sentences(), '', *columns(self.rows(), left=3).splitlines()]
+        return [*self.sentences(), '', *columns(self.rows(), align_left=3).splitlines()]
 
     def rows(self) -> list[list[str]]:
         """The table of solvers, its head first: errors as in Table 5.1 of the thesis, with bias, scale, noise."""

@@ -815,7 +815,7 @@ def test_offsets_in_a_command_outlast_silence(arm: Arm, disabled: bool) -> None:
         assert 'the command of the controller keeps ' in command.why
     else:
         loop.run(0.6)
-    np.testing.assert_allclose(loop.compensator.left, loop.has - ELBOW, atol=1e-12)
+    np.testing.assert_allclose(loop.compensator.remaining_offsets, loop.has - ELBOW, atol=1e-12)
     loop.reports = True
     if not disabled:
         assert loop.run(1.0).state is State.FOLLOWING
@@ -838,7 +838,7 @@ def test_a_command_of_somebody_else_keeps_nothing_from_here(arm: Arm) -> None:
     loop.reports, loop.has, count = True, ELBOW + 0.02, len(loop.sent)
     command = loop.run(0.6, ELBOW + 0.02)
     assert (command.state, command.foreign, len(loop.sent)) == (State.OFF, False, count)
-    assert not loop.compensator.left.any()
+    assert not loop.compensator.remaining_offsets.any()
 
 
 @pytest.mark.parametrize('output', ['commands', 'offsets'])
@@ -885,7 +885,7 @@ def test_earlier_offsets_are_removed_on_request_only(arm: Arm) -> None:
     worst = int(np.abs(held).argmax())
     assert (command.state, command.foreign, len(loop.sent)) == (State.OFF, True, count)
     assert command.why == f'the controller applies {held[worst]:.3g} at {arm.names[worst]}, which is not sent from here'
-    assert np.array_equal(loop.compensator.left, held)
+    assert np.array_equal(loop.compensator.remaining_offsets, held)
     loop.compensator.enable(False)
     command = loop.run(float(np.abs(held).max()) / 0.1 + 0.6)
     assert not loop.offsets.any()

@@ -169,7 +169,7 @@ def test_user_effect_is_calibrated_as_declared(tmp_path: Path, monkeypatch: pyte
     listed = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
     rig = load_rig(overrides=listed)
     vector = vector_of_rig(rig)
-    assert vector.others == []
+    assert vector.other_effects == []
     at = model.INDEX['psd_2.gain_x']
     assert vector.values[at] == 0.01
     # What a calibration finds goes into the effect that the file has; of others into the package's own.

@@ -81,7 +81,7 @@ def test_two_runs_are_as_one(file_of: Open) -> None:
     second = filled(rows[437:460])
     # The first blocks came before the disk had answered, and in the cell in which the first run ended.
     second.mark(START_NS + 230 * SECOND, '[2]')
-    second.restore(file.load(LATER, LATER))
+    second.load(file.load(LATER, LATER))
     for one in rows[460:]:
         second.add(one)
     full = filled(rows)
@@ -118,7 +118,7 @@ def test_what_lies_after_now_is_passed_over_and_goes(file_of: Open) -> None:
     assert [int(key) for key in kept.cells['key']] == [START_NS // (10 * SECOND)]
     assert kept.marks == []
     back = History(2, SIZE)
-    back.restore(kept)
+    back.load(kept)
     file.save(back.unsaved())
     assert len(file.load(LATER, LATER).cells) == 1
 
@@ -157,7 +157,7 @@ class Keeping:
         self.keeper.start()
 
     def restored(self) -> None:
-        until(self.keeper.restore)
+        until(self.keeper.load_saved)
 
     def saved(self) -> None:
         self.keeper.save()

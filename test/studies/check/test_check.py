@@ -315,7 +315,7 @@ def test_drift_under_load_steps_is_found_to_1_percent(tmp_path: Path, capsys: py
 @pytest.mark.slow
 def test_removed_weight_moves_dots_by_what_it_held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = load_rig()
-    before, after = ForwardModel(rig, settled=True).run(np.array([[0.0, 0.0, 0.0], [0.0, -50.0, -29.25]])).true_dots.T
+    before, after = ForwardModel(rig, steady=True).run(np.array([[0.0, 0.0, 0.0], [0.0, -50.0, -29.25]])).true_dots.T
     made = str(tmp_path / 'made')
     assert main(['simulate', '--out', made, '--loads', SWAYS[2]]) == 0
     observed = read_observation(made, rig)

@@ -132,7 +132,7 @@ def held(*levels: tuple[float, float, float], count: int = 800) -> FloatArray:
 
 def at_rest(rig: Rig, load: tuple[float, float, float]) -> FloatArray:
     """How far a load moves the dots (4,), m."""
-    before, after = ForwardModel(rig, settled=True).run(np.array([(0.0, 0.0, 0.0), load])).true_dots.T
+    before, after = ForwardModel(rig, steady=True).run(np.array([(0.0, 0.0, 0.0), load])).true_dots.T
     return np.asarray(after - before)
 
 

@@ -105,7 +105,7 @@ def test_what_depends_on_time_or_on_the_row_before_takes_no_part() -> None:
 def test_a_settled_reading_is_what_a_long_hold_ends_with() -> None:
     effects = [make_active('self_weight', {'weight_per_length': 20.0}, 'test'), SOFT]
     held = ForwardModel(RIG, effects).expect(np.tile(LOADS[8], (20_000, 1))).volts[:, -1]
-    settled = ForwardModel(RIG, effects, settled=True).expect(LOADS[8:9]).volts[:, 0]
+    settled = ForwardModel(RIG, effects, steady=True).expect(LOADS[8:9]).volts[:, 0]
     np.testing.assert_allclose(settled, held, rtol=1e-9, atol=1e-9)
 
 
