@@ -154,7 +154,7 @@ def _frames(tree: Mapping[str, Any]) -> float:
 def _as_found(problem: CertificateProblem, rows: Sequence[InputQuantity]) -> FloatArray:
     """Return the error by the values that were in use before."""
     given = problem.calibration['parameters']
-    moved = {name: one['used'] - one['value'] for name, one in given.items()}
+    moved = {name: entry['used'] - entry['value'] for name, entry in given.items()}
     return np.asarray(np.sum([moved.get(row.parameter, 0.0) * row.coefficients for row in rows], axis=0))
 
 
@@ -180,9 +180,9 @@ def _since_zero(inputs: Mapping[str, float], sights: Sequence[Situation]) -> lis
             continue
         each = [cause.sensitivities(at) for at in sights]
         freedom = cause.freedom(sights[0])
-        for own in zip(*each, strict=True):
-            first = own[0]
-            slopes = np.stack([s.coefficient for s in own])
+        for per_pose in zip(*each, strict=True):
+            first = per_pose[0]
+            slopes = np.stack([s.coefficient for s in per_pose])
             words = (cause.name, first.name, cause.observed, cause.distribution.value)
             out.append(InputQuantity(*words, first.deviation, cause.unit, freedom, slopes))
     return out
@@ -192,11 +192,11 @@ def _expanded(rows: Sequence[InputQuantity], correlations: FloatArray, pose: int
     """At one pose; every cause counts as one."""
     parts = {cause: [row for row in rows if row.cause == cause] for cause in dict.fromkeys(r.cause for r in rows)}
     variances, freedom = [], []
-    for cause, own in parts.items():
-        g = np.stack([row.u * row.coefficients[pose] for row in own])
-        together = correlations if cause == CALIBRATION else np.eye(len(own))
+    for cause, cause_rows in parts.items():
+        g = np.stack([row.u * row.coefficients[pose] for row in cause_rows])
+        together = correlations if cause == CALIBRATION else np.eye(len(cause_rows))
         variances.append(np.einsum('pi,pq,qi->i', g, together, g))
-        freedom.append(own[0].freedom)
+        freedom.append(cause_rows[0].freedom)
     return expanded(np.stack(variances), freedom, np.zeros(3))
 
 

@@ -82,13 +82,13 @@ def dots(chain: MeasuringChain, pose: FloatArray, dz: float = 0.0) -> FloatArray
     """
     tilted = tied_pose(pose, chain.slope_ratio, chain.link_length)
     plate = rotation(tilted[..., 2], tilted[..., 3], tilted[..., 4])[:, None]
-    own = rotation(chain.rotation, chain.tilt[..., 0], chain.tilt[..., 1])
+    sensor_rotation = rotation(chain.rotation, chain.tilt[..., 0], chain.tilt[..., 1])
     centre = lifted(chain.centers + chain.center_error, chain.heights + chain.height_error)
-    start = centre + np.einsum('...ij,...j->...i', own[..., :2], chain.zeros)
+    start = centre + np.einsum('...ij,...j->...i', sensor_rotation[..., :2], chain.zeros)
     start = start + lifted(chain.beam_shift, 0.0)
     moved = centre + lifted(chain.center_shift, 0.0)
     origin = np.einsum('...ij,...j->...i', plate, moved) + np.array([pose[0], pose[1], dz])
-    return hit(start, lifted(chain.beam_slope, 1.0), origin, plate @ own)
+    return hit(start, lifted(chain.beam_slope, 1.0), origin, plate @ sensor_rotation)
 
 
 def _read(chain: MeasuringChain, places: FloatArray) -> FloatArray:

@@ -198,10 +198,10 @@ def averaging_gain(block_size: int, frequency: float, sample_rate_hz: float) -> 
 
     20 samples at 1 kHz null 50 Hz and leave 0.16 of 60 Hz.
     """
-    turn = math.pi * frequency / sample_rate_hz
-    if abs(math.sin(turn)) < 1e-12:
+    half_phase = math.pi * frequency / sample_rate_hz
+    if abs(math.sin(half_phase)) < 1e-12:
         return 1.0
-    return abs(math.sin(block_size * turn) / (block_size * math.sin(turn)))
+    return abs(math.sin(block_size * half_phase) / (block_size * math.sin(half_phase)))
 
 
 def _interference(at: Situation) -> FloatArray:

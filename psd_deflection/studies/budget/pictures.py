@@ -39,17 +39,17 @@ def plotted_causes(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
         for cause, line in budget.lines
         if np.any(line.rms > least)
     ]
-    causes.sort(key=lambda one: -float(np.max(one.values / np.where(total > 0.0, total, 1.0))))
+    causes.sort(key=lambda cause: -float(np.max(cause.values / np.where(total > 0.0, total, 1.0))))
     return causes, total
 
 
 def bars_of(budget: Budget) -> Bars:
     """Return every cause, the largest first, below the total."""
     causes, total = plotted_causes(budget)
-    names = ['total', *(one.name for one in causes)]
-    colours: list[Colour] = ['text', *(COLOURS[one.kind] for one in causes)]
+    names = ['total', *(cause.name for cause in causes)]
+    colours: list[Colour] = ['text', *(COLOURS[cause.kind] for cause in causes)]
     columns = [
-        BarColumn(title, [float(total[i]), *(float(one.values[i]) for one in causes)], total[i], LEAST * total[i])
+        BarColumn(title, [float(total[i]), *(float(cause.values[i]) for cause in causes)], total[i], LEAST * total[i])
         for i, title in enumerate(TITLES)
     ]
     keys: list[tuple[str, Colour]] = [(kind.value, COLOURS[kind]) for kind in Kind]

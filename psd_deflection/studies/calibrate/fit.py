@@ -255,13 +255,13 @@ def explained(
         step, information = _step(linear, inverse, best.weights, z, prior, free, rows)
         z = z + step
     residual = linearised(rows, z, rig, kind).residual
-    misfit = float(np.einsum('ni,nij,nj,n->', residual, inverse, residual, best.weights))
+    chi_square = float(np.einsum('ni,nij,nj,n->', residual, inverse, residual, best.weights))
     scale = prior.sd[at]
     p = prior.covariance[np.ix_(at, at)] / np.outer(scale, scale)
     away = (z - prior.mean)[at] / scale
     scaled_information = information[np.ix_(at, at)] * np.outer(scale, scale)
     log_determinant = float(np.linalg.slogdet(np.eye(len(at)) + p @ scaled_information)[1])
-    return -0.5 * (misfit + float(away @ np.linalg.solve(p, away)) + log_determinant), z
+    return -0.5 * (chi_square + float(away @ np.linalg.solve(p, away)) + log_determinant), z
 
 
 def refitted(full_fit: CalibrationFit, rows: Rows, prior: Prior, row_weights: FloatArray, free: Mask) -> FloatArray:

@@ -59,8 +59,8 @@ def read_run(
         volts[place, i] = samples[channel]
     start = int(samples['t_ns'][0])
     t = np.interp(np.arange(n), place, (samples['t_ns'] - start).astype(np.float64)) * 1e-9
-    found = references_in(recording) if reference is None else read_references(reference)
-    references = References(np.zeros(0, np.int64), np.zeros((0, 3))) if found is None else found
+    given = references_in(recording) if reference is None else read_references(reference)
+    references = References(np.zeros(0, np.int64), np.zeros((0, 3))) if given is None else given
     applied = recording.loads()
     loads: FloatArray | None = None
     if applied:

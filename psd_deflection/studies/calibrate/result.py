@@ -115,7 +115,7 @@ def result(calibration: Calibration, date: str) -> dict[str, Any]:
     """Return the tree of calibration.json. ``date``: of the calibration, for the provenance."""
     sd = calibration.sd
 
-    def one(i: int) -> dict[str, Any]:
+    def parameter(i: int) -> dict[str, Any]:
         file = float(calibration.prior.mean[i])
         value, used = float(calibration.values[i]), float(calibration.used[i])
         return {'value': value, 'sd': float(sd[i]), 'unit': UNITS[i], 'file': file, 'used': used}
@@ -124,13 +124,13 @@ def result(calibration: Calibration, date: str) -> dict[str, Any]:
     reference_range = calibration.reference_range
     reference = calibration.fit.noise.reference
     return {
-        'parameters': {NAMES[i]: one(i) for i in at},
+        'parameters': {NAMES[i]: parameter(i) for i in at},
         'covariance': {'names': [NAMES[i] for i in at], 'matrix': calibration.covariance[np.ix_(at, at)].tolist()},
         'undetermined': [{'direction': d.parts, 'needs': d.needs} for d in calibration.undetermined],
         'noise': dict(zip(CHANNEL_NAMES, calibration.noise.tolist(), strict=True)),
         'gap': {'unit': 'm', **calibration.gap._asdict()},
         'kind': calibration.kind,
-        'zero': {NAMES[i]: one(i) for i in range(ZERO, COUNT)},
+        'zero': {NAMES[i]: parameter(i) for i in range(ZERO, COUNT)},
         'reference': {
             'noise': dict(zip(('dx', 'dy', 'theta'), reference.tolist(), strict=True)),
             'clock_offset': {

@@ -151,16 +151,16 @@ class Guide:
     def _pushed(self, here: FloatArray, filled: float) -> str:
         rest = self._rests[-1][1]
         moved = here.mean(axis=0) - rest
-        far = float(np.linalg.norm(moved))
+        distance = float(np.linalg.norm(moved))
         needed = max(LEAST_PUSH, STAND_OUT * float(np.linalg.norm(self._rest_sd)))
         moving = float(np.linalg.norm(here.std(axis=0)))
-        held = far > needed and moving < STEADY * far
+        held = distance > needed and moving < STEADY * distance
         self.progress = filled if held else 0.0
         if max(float(np.abs(v[:, DOT_CHANNELS]).max()) for v in self._samples) >= self._rail:
             return self._impatient('A dot is at the end of its PSD: push less.')
         if not held:
-            if far <= needed:
-                return self._impatient(f'No push yet: the dots have moved by {far * 1e6:.1f} µm.')
+            if distance <= needed:
+                return self._impatient(f'No push yet: the dots have moved by {distance * 1e6:.1f} µm.')
             return self._impatient('Hold it steadier.')
         if filled < 1.0:
             return ''

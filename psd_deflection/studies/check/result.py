@@ -126,9 +126,9 @@ def mains_hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float,
         waves = np.exp(-2j * np.pi * np.outer([frequency, *(frequency + o for o in offsets)], t))
         sizes = 2.0 * np.abs(waves @ values) / window.sum()
         there = sizes[0] > np.maximum(_STANDS_OUT * np.median(sizes[1:], axis=0), HUM_SHARE * noise)
-        found = np.where(there, sizes[0], 0.0)
-        if found.max() > best[1].max():
-            best = (frequency, found)
+        hum = np.where(there, sizes[0], 0.0)
+        if hum.max() > best[1].max():
+            best = (frequency, hum)
     return best
 
 
@@ -404,7 +404,7 @@ def level_rows(checkup: Checkup) -> list[tuple[str, str]]:
 
 
 def _wiring_json(wiring: Wiring) -> dict[str, object]:
-    axes = {f'psd_{psd}.axes': list(own) for psd, own in enumerate(wiring.axes, start=1)}
+    axes = {f'psd_{psd}.axes': list(psd_axes) for psd, psd_axes in enumerate(wiring.axes, start=1)}
     return {'psds_exchanged': wiring.exchanged, **axes}
 
 

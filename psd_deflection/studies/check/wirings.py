@@ -35,9 +35,9 @@ def wirings_of(file: Wiring) -> Sequence[Wiring]:
         return WIRINGS
     tried = {file.axes: None}
     for first, second in itertools.combinations(range(count), 2):
-        for one, other in itertools.product(_AXES, _AXES):
+        for first_axes, second_axes in itertools.product(_AXES, _AXES):
             axes = list(file.axes)
-            axes[first], axes[second] = one, other
+            axes[first], axes[second] = first_axes, second_axes
             tried[tuple(axes)] = None
     tried.update(dict.fromkeys((axes,) * count for axes in _AXES))
     swaps: list[tuple[bool, tuple[int, ...]]] = [(file.exchanged, ()), (not file.exchanged, ())]
@@ -167,8 +167,8 @@ def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
     loads_of_responses = [response.loads for response in responses]
     for count in range(len(loads_of_responses) + 1):
         fits: list[WiringFit] = []
-        for some in itertools.combinations(loads_of_responses, count):
-            loads = tuple(itertools.chain.from_iterable(some))
+        for subset in itertools.combinations(loads_of_responses, count):
+            loads = tuple(itertools.chain.from_iterable(subset))
             for wiring in WIRINGS:
                 total, worst = residuals(wiring, responses, loads)
                 if worst <= LIMIT:

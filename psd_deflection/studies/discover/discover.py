@@ -349,8 +349,8 @@ def law(problem: Problem) -> Problem:
     # Coarse steps cause noise that varies with the signal, which is no law.
     if rig_of(problem).recorded.value_grid is not None:
         return problem
-    much = ws.gap(fit.difference) > SIGNIFICANT * ws.floor()
-    if not (unknown_of(problem.residual, 1.0) or much or coincidences(fit, ws.physics)):
+    large_gap = ws.gap(fit.difference) > SIGNIFICANT * ws.floor()
+    if not (unknown_of(problem.residual, 1.0) or large_gap or coincidences(fit, ws.physics)):
         return problem
     found_law = find_law(
         ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.rng, problem.progress

@@ -138,5 +138,5 @@ class DiscoverOptions:
         if self.span != FULL:
             raise RecordingError(f'{tables[0].name}: holds readings of a link at rest: take all of it')
         readings = optional('psd_deflection.studies.discover.readings')
-        found: StudyResult = readings.discovered(tables, self.without, self.params_file, notify, self.seed)
-        return found
+        result: StudyResult = readings.discovered(tables, self.without, self.params_file, notify, self.seed)
+        return result

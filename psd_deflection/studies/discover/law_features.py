@@ -270,11 +270,11 @@ def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targe
             rows = [t.evaluate(r.known.__getitem__, len(r.known['time']), r.period, {}) for t in batch]
             for way in ways:
                 # Only loads and what is like them drive a mode.
-                some = [i for i, t in enumerate(batch) if way == 0 or allowed('static_dx', t)]
-                if some:
-                    at = np.stack([_blocks(r, _through(r, way, rows[i])) for i in some])
-                    totals[way, some] += (at @ r.weight).reshape(len(some), count, k)
-                    lengths[way, some] += at**2 @ r.length
+                driving = [i for i, t in enumerate(batch) if way == 0 or allowed('static_dx', t)]
+                if driving:
+                    at = np.stack([_blocks(r, _through(r, way, rows[i])) for i in driving])
+                    totals[way, driving] += (at @ r.weight).reshape(len(driving), count, k)
+                    lengths[way, driving] += at**2 @ r.length
         for i, term in enumerate(batch):
             for t, name in enumerate(every):
                 if name not in targets or not allowed(name, term):

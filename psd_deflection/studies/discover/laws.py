@@ -379,8 +379,8 @@ def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
     changes = np.flatnonzero(np.any(np.diff(o.loads, axis=0) != 0.0, axis=1)) * o.period
     if len(times) < MANY_TIMES or more or len(changes) == 0 or len(changes) > o.duration:
         return False
-    near = np.abs(times[:, None] - changes).min(axis=1) < NEAR_S
-    return bool(np.mean(near) > 0.5)
+    at_change = np.abs(times[:, None] - changes).min(axis=1) < NEAR_S
+    return bool(np.mean(at_change) > 0.5)
 
 
 def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
@@ -444,7 +444,7 @@ def simplest(best: LawTrial, alternatives: Sequence[LawTrial]) -> LawTrial:
     A sensor's own dot goes before the pose, on which its dot depends.
     """
     beside = [a.effect.name for a in best.beside]
-    near = [
+    tied = [
         t
         for t in (best, *alternatives)
         if t.fit.chi2 - best.fit.chi2 < TIED
@@ -456,7 +456,7 @@ def simplest(best: LawTrial, alternatives: Sequence[LawTrial]) -> LawTrial:
         foreign = sum(v in POSE for law in t.laws if law.acts_on in DOTS for v in law.variables)
         return t.terms, len(t.variables), foreign, t.cost
 
-    return min(near, key=rank)
+    return min(tied, key=rank)
 
 
 def tied_laws(best: LawTrial, alternatives: Sequence[LawTrial]) -> tuple[Law, ...]:

@@ -110,7 +110,7 @@ def read_tables(
     """
     listed = list(entries(sources))
     alone = [None if is_table(source) else _without_samples(source, namespace) for source, _, _ in listed]
-    kinds = [is_table(source) or found is not None for (source, _, _), found in zip(listed, alone, strict=True)]
+    kinds = [is_table(source) or recording is not None for (source, _, _), recording in zip(listed, alone, strict=True)]
     if not any(kinds):
         return []
     if not all(kinds):

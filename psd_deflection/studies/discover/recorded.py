@@ -122,11 +122,11 @@ def on_one_clock(recorded: Recorded) -> Recorded:
         return recorded
     results = [aligned(o.rig, o.volts, o.loads) for o in recorded.observations]
     late = results[0][1]
-    for o, (_, others) in zip(recorded.observations, results, strict=True):
-        if [(a.psd, a.rows) for a in others] != [(a.psd, a.rows) for a in late]:
+    for o, (_, late_psds) in zip(recorded.observations, results, strict=True):
+        if [(a.psd, a.rows) for a in late_psds] != [(a.psd, a.rows) for a in late]:
             words = (
                 a.words(name)
-                for name, listed in ((recorded.observations[0].name, late), (o.name, others))
+                for name, listed in ((recorded.observations[0].name, late), (o.name, late_psds))
                 for a in listed
             )
             raise RecordingError(f'{"; ".join(words)}: the clocks are not alike: search the recordings one by one')
@@ -181,9 +181,9 @@ def snapped(recorded: Recorded) -> Recorded:
 
 def _common_step(observations: Sequence[Observation]) -> CoarseStep | None:
     """That of all recordings, None if one has none."""
-    found = [coarse_step(o) for o in observations]
-    steps = [s for s in found if s is not None]
-    if not steps or len(steps) < len(found):
+    per_recording = [coarse_step(o) for o in observations]
+    steps = [s for s in per_recording if s is not None]
+    if not steps or len(steps) < len(per_recording):
         return None
     # The recording with the widest range of values determines it best.
     return min(steps, key=lambda s: s.sd)._replace(sums=all(s.sums for s in steps))

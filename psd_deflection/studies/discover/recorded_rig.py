@@ -117,10 +117,10 @@ class RecordedRig(Machine):
     ) -> list[tuple[Candidate, Columns]]:
         """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
         reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
-        beyond, throughout = excess(ws, residual)
+        excess_chi_square, throughout = excess(ws, residual)
         if reading is None or not reading.acquits or throughout < FAR - 1.0:
             return signatures
-        least = 2.0 * reading.allowed / (PART * beyond)
+        least = 2.0 * reading.allowed / (PART * excess_chi_square)
         # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.
         return [
             (c, columns)

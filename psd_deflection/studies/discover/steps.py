@@ -174,8 +174,8 @@ def credible(problem: Problem) -> Problem:
 def _of_another_shape(problem: Problem) -> Problem:
     """``problem`` with a better fit of its effects, if another shape explains the little that this one leaves."""
     ws, search_used, fit, result = problem.comparison, problem.search, problem.fit, problem.result
-    little = max(SIGNIFICANT * ws.floor(), LITTLE * problem.gap_before)
-    if ws.open_level or ws.gap(fit.difference) > little:
+    limit = max(SIGNIFICANT * ws.floor(), LITTLE * problem.gap_before)
+    if ws.open_level or ws.gap(fit.difference) > limit:
         return problem
     better = search_used.of_another_shape(fit)
     if better is fit:
@@ -271,8 +271,8 @@ def where(problem: Problem) -> Problem:
 def predict(problem: Problem) -> Problem:
     """Return the model that predicts best beside the named effects; what it explains beyond them is unknown."""
     ws, fit, search_used = problem.comparison, problem.fit, problem.search
-    little = not ws.open_level and ws.gap(fit.difference) <= SIGNIFICANT * ws.floor()
-    if little and not problem.unknown and not problem.result.limits:
+    within_noise = not ws.open_level and ws.gap(fit.difference) <= SIGNIFICANT * ws.floor()
+    if within_noise and not problem.unknown and not problem.result.limits:
         return problem
     problem.progress('predicting')
     predictive = predictive_of(ws, fit, search_used.screen, problem.rng)

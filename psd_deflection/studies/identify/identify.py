@@ -73,12 +73,12 @@ class Identified(StudyResult):
 
     def withheld_reason(self, name: str) -> str | None:
         """Why the rig file does not get the mode of this kind; None if it does, or if none was found."""
-        found = [self.axes[i].modes for i in KINDS[name] if self.axes[i].modes]
-        if not found:
+        mode_lists = [self.axes[i].modes for i in KINDS[name] if self.axes[i].modes]
+        if not mode_lists:
             return None
-        if any(len(close_modes(modes)) > 1 for modes in found):
+        if any(len(close_modes(modes)) > 1 for modes in mode_lists):
             return 'two modes close to each other, and the rig file describes one'
-        first = [modes[0] for modes in found]
+        first = [modes[0] for modes in mode_lists]
         apart = abs(first[0].frequency - first[-1].frequency)
         if apart > max(3.0 * math.hypot(first[0].frequency_sd, first[-1].frequency_sd), AGREE * first[0].frequency):
             return f'{SYMBOLS[0]} and {SYMBOLS[1]} ring at different frequencies, and the rig file has one for both'

@@ -446,8 +446,8 @@ def variance_at(fit: RingFit, stretches: Sequence[Stretch], rate: float, frequen
     from scipy.signal import periodogram
 
     f, p = periodogram(fit.residual, rate)
-    near = np.abs(f - frequency) < max(0.3 * frequency, 5.0 * rate / len(fit.residual))
+    band = np.abs(f - frequency) < max(0.3 * frequency, 5.0 * rate / len(fit.residual))
     close = sum(abs(k - frequency) < 0.3 * frequency for k, _ in fit.modes)
-    free = 2 * int(near.sum()) - 2 * close * (len(stretches) + 1)
-    share = 2 * int(near.sum()) / max(free, 2)
-    return max(variance_of(fit, stretches), float(p[near].mean()) * 0.5 * rate * share)
+    free = 2 * int(band.sum()) - 2 * close * (len(stretches) + 1)
+    share = 2 * int(band.sum()) / max(free, 2)
+    return max(variance_of(fit, stretches), float(p[band].mean()) * 0.5 * rate * share)

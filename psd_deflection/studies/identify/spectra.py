@@ -143,8 +143,8 @@ def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> C
     matrix = np.array([[shape[at].mean() / power for shape in shapes] for at, power in bands])
     sizes = np.linalg.norm(matrix, axis=0)
     weights, _ = nnls(matrix / sizes, np.ones(len(bands)))
-    white, walk = (weights / sizes)[:2]
-    return ColouredNoise(float(white), float(walk))
+    white, random_walk = (weights / sizes)[:2]
+    return ColouredNoise(float(white), float(random_walk))
 
 
 def exceeds_noise(filled: FloatArray, rate: float, frequency: float, noise: ColouredNoise) -> bool:
@@ -234,10 +234,10 @@ def information_of(density: Callable[[FloatArray], FloatArray], x: FloatArray) -
     step = 1e-5
     columns = []
     for i in range(len(x)):
-        ahead, behind = x.copy(), x.copy()
-        ahead[i] += step
-        behind[i] -= step
-        columns.append((np.log(density(ahead)) - np.log(density(behind))) / (2.0 * step))
+        upper, lower = x.copy(), x.copy()
+        upper[i] += step
+        lower[i] -= step
+        columns.append((np.log(density(upper)) - np.log(density(lower))) / (2.0 * step))
     jacobian = np.column_stack(columns)
     out: FloatArray = jacobian.T @ jacobian
     return out

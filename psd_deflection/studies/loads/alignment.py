@@ -74,10 +74,10 @@ def aligned(rig: Rig, volts: FloatArray, loads: FloatArray) -> tuple[FloatArray,
     psds, period = len(rig.psds), 1.0 / rig.converter.sample_rate_hz
     dots = volts[:, dot_channels(psds)].reshape(len(volts), psds, 2)
     listed = _listed_delays(rig)
-    found = [TimeShift(0.0, 0.0)]
+    shifts = [TimeShift(0.0, 0.0)]
     for k in range(1, psds):
-        found.append(time_shift(dots[:, 0], dots[:, k], period, REACH_S, listed[k] - listed[0]))
-    later = [f.seconds - listed[k] + listed[0] if f.evidence else 0.0 for k, f in enumerate(found)]
+        shifts.append(time_shift(dots[:, 0], dots[:, k], period, REACH_S, listed[k] - listed[0]))
+    later = [f.seconds - listed[k] + listed[0] if f.evidence else 0.0 for k, f in enumerate(shifts)]
     rows = [round(late / period) for late in later]
     if not any(rows):
         return volts, ()
@@ -95,7 +95,7 @@ def aligned(rig: Rig, volts: FloatArray, loads: FloatArray) -> tuple[FloatArray,
     r = min(range(psds), key=off)
     moved = [n - rows[r] for n in rows]
     late = [
-        LatePsd(k + 1, r + 1, later[k] - later[r], max(found[k].sd, found[r].sd), moved[k], _largest(found, k, r))
+        LatePsd(k + 1, r + 1, later[k] - later[r], max(shifts[k].sd, shifts[r].sd), moved[k], _largest(shifts, k, r))
         for k in range(psds)
         if moved[k]
     ]
@@ -111,15 +111,15 @@ def _listed_delays(rig: Rig) -> list[float]:
     return out
 
 
-def _largest(found: Sequence[TimeShift], *psds: int) -> float:
-    return max(found[k].evidence for k in psds)
+def _largest(shifts: Sequence[TimeShift], *psds: int) -> float:
+    return max(shifts[k].evidence for k in psds)
 
 
 def _moved(volts: FloatArray, rows: Sequence[int]) -> FloatArray:
     """``volts`` (n, 3P) with the readings of each PSD so many ``rows`` earlier; NaN where there are none."""
     out = np.full_like(volts, np.nan)
-    for k, by in enumerate(rows):
+    for k, offset in enumerate(rows):
         psd = slice(3 * k, 3 * k + 3)
-        here = volts[max(by, 0) : len(volts) + min(by, 0), psd]
-        out[max(-by, 0) : max(-by, 0) + len(here), psd] = here
+        here = volts[max(offset, 0) : len(volts) + min(offset, 0), psd]
+        out[max(-offset, 0) : max(-offset, 0) + len(here), psd] = here
     return out

@@ -223,8 +223,8 @@ def unannotated_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[flo
     between = calm_between(steps, len(dots), width, period)
     out = []
     for j, step in enumerate(steps):
-        near = (changes >= step.first - 2 * width) & (changes <= step.last + 2 * width)
-        if not near.any():
+        nearby = (changes >= step.first - 2 * width) & (changes <= step.last + 2 * width)
+        if not nearby.any():
             out.append(time_of_step(rig, dots, step, between[j], period)[0])
     return out
 

@@ -136,8 +136,8 @@ def _swung(implied: ImpliedLoads, p: Hold, frequency: float, period: float) -> F
     a, b = p.first // size + round(RINGS_S / (period * size)), p.last // size
 
     def tone(at: FloatArray) -> FloatArray:
-        along, turn = at / count, 2.0 * math.pi * frequency * period * at
-        swing = np.array([np.sin(turn), np.cos(turn)])
+        along, phase = at / count, 2.0 * math.pi * frequency * period * at
+        swing = np.array([np.sin(phase), np.cos(phase)])
         return np.array([*swing, *along * swing, *along**2 * swing, np.ones_like(at)])
 
     part = implied.rest[:2, a:b]

@@ -157,10 +157,10 @@ def implied_loads(
     beside = np.where(there, across_plate(rig, difference), np.nan)
     across = np.array([[_mean(row[p.first // size : p.last // size]) for p in listed] for row in beside])
     across = across - across[:, :1]
-    far = across[0] if len(across) == 1 else np.linalg.norm(across, axis=0)
+    distance = across[0] if len(across) == 1 else np.linalg.norm(across, axis=0)
     # What the first time has is an offset, which all have.
     moved = np.where(there, moved, np.nan)
-    return ImpliedLoads(tuple(listed), more, rest, moved, beside, far, compliance, size)
+    return ImpliedLoads(tuple(listed), more, rest, moved, beside, distance, compliance, size)
 
 
 def implied_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Hold]], ImpliedLoads]:
@@ -247,8 +247,8 @@ def is_known(implied: ImpliedLoads, gone: IntArray, largest: float) -> bool:
     change was noted twice.
     """
     twice = np.array([_annotated_twice(implied, int(k)) is not None for k in gone])
-    far = np.linalg.norm(implied.more[gone], axis=1) > largest * np.linalg.norm(implied.annotated[gone], axis=1)
-    return bool(np.all(_alike(implied, gone) | far | twice))
+    too_large = np.linalg.norm(implied.more[gone], axis=1) > largest * np.linalg.norm(implied.annotated[gone], axis=1)
+    return bool(np.all(_alike(implied, gone) | too_large | twice))
 
 
 def _alike(implied: ImpliedLoads, gone: IntArray) -> BoolArray:
@@ -439,8 +439,8 @@ def wrong_notes_against(
     # the readings themselves say hung is simulated, then judged.
     annotated = first.annotated
     readings_ask = asked(np.zeros_like(loads)).more
-    far = np.abs(readings_ask - annotated).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
-    applied = np.where(far[:, None], readings_ask, annotated)
+    distant = np.abs(readings_ask - annotated).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
+    applied = np.where(distant[:, None], readings_ask, annotated)
 
     def against() -> ImpliedLoads:
         off = np.flatnonzero((applied != annotated).any(axis=1)).tolist()

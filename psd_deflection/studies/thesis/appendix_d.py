@@ -130,15 +130,15 @@ def appendix_d_iterative(
     start_1 = atan(x1 / y1)
     start_2 = -atan(y2 / x2) if y2 != 0.0 and x2 < 0.0 else atan(y2 / x2)
     for a in range(401):
-        turn = 0.01 * pi / 180.0 * a
-        x1_a = d1 * sin(start_1 + turn)
-        y1_a = d1 * cos(start_1 + turn)
-        x1_b = d1 * sin(start_1 - turn)
-        y1_b = d1 * cos(start_1 - turn)
-        x2_a = -d2 * cos(start_2 + turn)
-        y2_a = d2 * sin(start_2 + turn)
-        x2_b = -d2 * cos(start_2 - turn)
-        y2_b = d2 * sin(start_2 - turn)
+        angle = 0.01 * pi / 180.0 * a
+        x1_a = d1 * sin(start_1 + angle)
+        y1_a = d1 * cos(start_1 + angle)
+        x1_b = d1 * sin(start_1 - angle)
+        y1_b = d1 * cos(start_1 - angle)
+        x2_a = -d2 * cos(start_2 + angle)
+        y2_a = d2 * sin(start_2 + angle)
+        x2_b = -d2 * cos(start_2 - angle)
+        y2_b = d2 * sin(start_2 - angle)
         test_a = abs((x1_a - x1_init) - (x2_a - x2_init)) < 0.1
         test_b = abs((x1_b - x1_init) - (x2_b - x2_init)) < 0.1
         if test_a or (test_b and _ratio(y1_a - y1_init, y2_a - y2_init)):

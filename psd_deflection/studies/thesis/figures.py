@@ -111,7 +111,7 @@ def iterative() -> Figure:
 def linear() -> Figure:
     """Return the error of linearising, and which channels the weights use."""
     geometry = thesis_geometry()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout='constrained')
+    figure, (error_axes, leverage_axes) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout='constrained')
     theta = np.radians(np.linspace(-3, 3, 121))
     poses = np.zeros((len(theta), 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 2e-3, -2e-3, theta
@@ -122,9 +122,9 @@ def linear() -> Figure:
         ('wls_exact (either weights)', 'wls_exact', {'weights': 'thesis'}, _GREEN, '-'),
     ):
         solution = make_solver(name, geometry, **options).solve_many(dots, VARIANCES).pose
-        left.plot(np.degrees(theta), 1e6 * (solution[:, 0] - 2e-3), color=color, ls=dash, label=label)
-    left.set(xlabel='twist, deg', ylabel='error of ΔX, µm', title='tip at (2, -2) mm, no noise')
-    left.legend(fontsize=8)
+        error_axes.plot(np.degrees(theta), 1e6 * (solution[:, 0] - 2e-3), color=color, ls=dash, label=label)
+    error_axes.set(xlabel='twist, deg', ylabel='error of ΔX, µm', title='tip at (2, -2) mm, no noise')
+    error_axes.legend(fontsize=8)
     design = design_matrix(geometry.beams)
     for k, (label, scaling, color) in enumerate(
         (
@@ -135,10 +135,10 @@ def linear() -> Figure:
     ):
         po = np.array(scaling)
         leverage = np.diag(po[:, None] * design @ gain_matrix(design, po) / po)
-        right.bar(np.arange(4) + 0.27 * (k - 1), leverage, 0.25, color=color, label=label)
-    right.set(xticks=range(4), xticklabels=['x1', 'y1', 'x2', 'y2'], ylabel='leverage', ylim=(0, 1.45))
-    right.set_title('how much of a reading its own fit follows')
-    right.legend(fontsize=8, loc='upper left')
+        leverage_axes.bar(np.arange(4) + 0.27 * (k - 1), leverage, 0.25, color=color, label=label)
+    leverage_axes.set(xticks=range(4), xticklabels=['x1', 'y1', 'x2', 'y2'], ylabel='leverage', ylim=(0, 1.45))
+    leverage_axes.set_title('how much of a reading its own fit follows')
+    leverage_axes.legend(fontsize=8, loc='upper left')
     return figure
 
 
@@ -270,8 +270,8 @@ def beam() -> Figure:
 def pose() -> Figure:
     """How three PSDs at different heights make the tilts visible."""
     steps = np.geomspace(2e-3, 0.1, 25)
-    turns = np.radians([0.0, 120.0, 240.0])
-    centers = 0.1 * np.column_stack((np.cos(turns), np.sin(turns)))
+    angles = np.radians([0.0, 120.0, 240.0])
+    centers = 0.1 * np.column_stack((np.cos(angles), np.sin(angles)))
     at = np.array([0.1e-3, -2e-3, -0.015, 0.0, 0.0])
     deviations = []
     for step in steps:
@@ -304,23 +304,23 @@ def base_pair() -> Figure:
         ]
     )
     dots = (places - geometry.centers).reshape(len(poses), -1)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')
+    figure, (error_axes, travel_axes) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')
     for assume, color in (('no_twist', _RED), ('beam', _GREEN)):
         solution = make_solver('base_pair', geometry, assume=assume).solve_many(dots, VARIANCES).pose
-        left.plot(np.degrees(theta), 1e3 * (solution[:, 1] + 2e-3), color=color, label=f'assume {assume}')
-    left.set(xlabel='true twist, deg', ylabel='error of ΔY, mm', title='tip at (1, -2) mm, exact readings')
-    left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
-    left.legend(fontsize=8)
+        error_axes.plot(np.degrees(theta), 1e3 * (solution[:, 1] + 2e-3), color=color, label=f'assume {assume}')
+    error_axes.set(xlabel='true twist, deg', ylabel='error of ΔY, mm', title='tip at (1, -2) mm, exact readings')
+    error_axes.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
+    error_axes.legend(fontsize=8)
     distance = np.linspace(0.0, 0.6, 61)
     for k, color in ((1.0, _ORANGE), (1.5, _BLUE), (2.0, _GREEN)):
-        right.plot(1e3 * distance, 1.0 - k * distance / 0.585, color=color, label=f'k = {k:g}')
-    right.axhline(0.0, color='black', lw=0.8)
-    right.set(
+        travel_axes.plot(1e3 * distance, 1.0 - k * distance / 0.585, color=color, label=f'k = {k:g}')
+    travel_axes.axhline(0.0, color='black', lw=0.8)
+    travel_axes.set(
         xlabel='lasers to PSD, mm',
         ylabel='dot travel per deflection',
         title='where a tilt hides the deflection (Fig. 5.9)',
     )
-    right.legend(fontsize=8)
+    travel_axes.legend(fontsize=8)
     return figure
 
 

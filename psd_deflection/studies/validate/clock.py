@@ -100,8 +100,8 @@ class Motion:
             poses[good] = self.solve(values[good])
             # The pose over a tenth of a sample, by the fitted rates of the dots.
             step = 0.1 * self.period
-            ahead, behind = (self.solve(values[good] + sign * step * rates[good]) for sign in (1.0, -1.0))
-            speeds[good] = (ahead - behind) / (2.0 * step)
+            later, earlier = (self.solve(values[good] + sign * step * rates[good]) for sign in (1.0, -1.0))
+            speeds[good] = (later - earlier) / (2.0 * step)
         return poses, speeds
 
     def grid(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
@@ -262,11 +262,11 @@ def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float
         )
     used = len(best.residual)
     least = best.chi_square(best.sizes)
-    near = APART * motion.period
+    separation = APART * motion.period
     alternatives = tuple(
         f.value
         for f in fits
-        if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < ALTERNATIVE_LOSS
+        if abs(f.value - best.value) > separation and used * (f.chi_square(best.sizes) - least) < ALTERNATIVE_LOSS
     )
     explained = used * (biweight_sum((poses - np.median(poses, axis=0)) / best.sizes) - least)
     return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, alternatives, used)
@@ -367,7 +367,7 @@ class UsedReferences:
         scale = np.sqrt((causes * causes).mean(axis=0))
         causes = causes / scale
         residual = np.empty((k, 3))
-        own = np.empty((k, 3))
+        sensitivity = np.empty((k, 3))
         ramp = np.empty((k, 3))
         sizes = np.empty(3)
         for axis in range(3):
@@ -382,17 +382,17 @@ class UsedReferences:
             # Beside it what an offset that grows with time does.
             both = np.column_stack([does, does * self.t])
             both -= causes @ np.linalg.lstsq(causes * root, both * root, rcond=1e-10)[0]
-            own[:, axis], ramp[:, axis] = both.T
+            sensitivity[:, axis], ramp[:, axis] = both.T
         next_weights = np.clip(1.0 - (residual / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
         w = next_weights / sizes**2
-        information = float((w * own * own).sum())
+        information = float((w * sensitivity * sensitivity).sum())
         if information <= 0.0:
             return 0.0, OffsetFit(0.0, math.inf, 0.0, math.inf, residual, sizes), next_weights
-        step = float((w * own * residual).sum()) / information
-        scores = (w * own * residual).sum(axis=1)
+        step = float((w * sensitivity * residual).sum()) / information
+        scores = (w * sensitivity * residual).sum(axis=1)
         variance = max(variance_of_sum(scores) / information**2, 1.0 / information)
         # The offset's growth with time, by what is left.
-        ramp = ramp - own * (float((w * own * ramp).sum()) / information)
+        ramp = ramp - sensitivity * (float((w * sensitivity * ramp).sum()) / information)
         grows = float((w * ramp * ramp).sum())
         drift = float((w * ramp * residual).sum()) / grows if grows > 0.0 else 0.0
         drift_variance = variance_of_sum((w * ramp * residual).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf

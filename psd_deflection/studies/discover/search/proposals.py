@@ -140,10 +140,10 @@ def _common_step(volts: FloatArray, lsb: float) -> tuple[float, float] | None:
     reach = 4.0
     span = float(np.abs(values).max())
     while True:
-        near = values[np.abs(values) <= reach * gap + 1.0]
-        k = np.rint(near / gap)
+        close = values[np.abs(values) <= reach * gap + 1.0]
+        k = np.rint(close / gap)
         if np.any(k != 0):
-            gap = float(np.dot(k, near) / np.dot(k, k))
+            gap = float(np.dot(k, close) / np.dot(k, k))
         if reach * gap >= span:
             break
         reach *= 2.0

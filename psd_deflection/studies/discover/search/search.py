@@ -110,11 +110,11 @@ def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[A
 
 def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
     """Starts: either natural frequency is wrong, or both are."""
-    near = []
+    frequencies = []
     for s in scores:
         if s.candidate.effect.name in RINGING and s.candidate.effect.name in trials.workspace.first:
-            near.append(frequency(trials.workspace, null, s))
-    return [*([a] for a in near), *([near] if len(near) > 1 else [])]
+            frequencies.append(frequency(trials.workspace, null, s))
+    return [*([a] for a in frequencies), *([frequencies] if len(frequencies) > 1 else [])]
 
 
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
@@ -241,8 +241,8 @@ class Search(Trials):
 
     def _limits(self, current: Fit) -> tuple[Limit, ...]:
         """Return the limit that kept further effects out, with what lies beyond it."""
-        little = current.chi2 <= (1.0 + NEAR) * self.workspace.size and not self.workspace.open_level
-        if not self._stopped or little:
+        within_noise = current.chi2 <= (1.0 + NEAR) * self.workspace.size and not self.workspace.open_level
+        if not self._stopped or within_noise:
             return ()
 
         terms = further_terms(self.screen, current, self.may_pass, self.workspace.first)
@@ -280,8 +280,8 @@ class Search(Trials):
     def _looks_closer(self, current: Fit) -> bool:
         """Whether the signatures are new: those beside ``current``, if it leaves something that no other explains."""
         known = self._beside == tuple(a.label for a in current.effects)
-        little = current.chi2 <= (1.0 + NEAR) * self.workspace.size
-        if known or little or self.spent >= self.budget_of(current):
+        within_noise = current.chi2 <= (1.0 + NEAR) * self.workspace.size
+        if known or within_noise or self.spent >= self.budget_of(current):
             return False
         self._screen_anew(current)
         return True

@@ -286,8 +286,8 @@ class Trials:
         size = self.workspace.size
         if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
             return False
-        little = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
-        return little and not (len(smaller.effects) >= MANY and self._library_explains(smaller))
+        small_gain = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
+        return small_gain and not (len(smaller.effects) >= MANY and self._library_explains(smaller))
 
     def _library_explains(self, fit: Fit) -> bool:
         """Whether some more effects beside ``fit`` would leave next to nothing on unseen load cases, to first order."""
@@ -317,15 +317,15 @@ class Trials:
 
     def refit(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
         """Both fits again, with free loads and times as ``fit`` asks for: else a small effect stands in for these."""
-        settled = self.workspace.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
-        if settled is self.workspace:
+        refitted = self.workspace.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
+        if refitted is self.workspace:
             return null, fit
-        better = refit(settled, fit.effects, iterations=6)
-        if settled.gap(better.difference) > self.workspace.gap(fit.difference):
+        better = refit(refitted, fit.effects, iterations=6)
+        if refitted.gap(better.difference) > self.workspace.gap(fit.difference):
             return null, fit
-        self.workspace = settled
+        self.workspace = refitted
         self.dropped.clear()
-        return refit(settled, ()), better
+        return refit(refitted, ()), better
 
     def at(self, workspace: Comparison) -> Self:
         """Return the same search over another comparison of the same recordings."""

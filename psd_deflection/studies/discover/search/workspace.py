@@ -303,10 +303,10 @@ class Workspace(Comparison):
         for w, o, c, s in zip(self.noise, self.observations, self.count, self.fine, strict=True):
             share = fine_means(c[self.rows], o.rig.estimator.block_size // s)
             variance = (w.block_sigma[self.rows] * o.rig.sensitivities.ravel())[:, None] ** 2
-            counted = share >= 0.5
+            valid = share >= 0.5
             # A block with some samples missing is noisier.
-            total += float((variance / np.maximum(share, 0.5))[counted].sum())
-            count += int(counted.sum())
+            total += float((variance / np.maximum(share, 0.5))[valid].sum())
+            count += int(valid.sum())
         return float(np.sqrt(total / max(count, 1)))
 
     def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:
