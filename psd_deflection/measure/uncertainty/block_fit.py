@@ -43,6 +43,9 @@ _FORGET = 1.0 / 12.0
 _BIAS = 0.5
 """Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
 
+_GAPS = 0.15
+"""Times v_k of a block with gaps, added to tau_k^2: so uncertain is what such blocks say of the motion."""
+
 _LASTING = 250.0
 """Blocks, at the most, of the mean of motion that goes on alike: 5 s of 20 samples at 1 kHz. Its error is a fifth of
 that of the short one, so that motion which bends a block by a fifth of its noise is distinguished from noise."""
@@ -364,7 +367,10 @@ class BlockFit:
         # Of the noise and the motion of late.
         expected = usual_v[:reported] + np.maximum(late[1:, :reported], 0.0)
         lasting = _lasting_after(memory.lasting, excess, terms.sure, late[1:, :reported], expected)
-        usual = np.maximum(late - _BIAS * usual_v, 1e-9 * usual_v)
+        bias = _BIAS * usual_v
+        if terms is not self._full:
+            bias[:reported] -= _GAPS * terms.v
+        usual = np.maximum(late - bias, 1e-9 * usual_v)
         np.maximum(usual, lasting[:, 0] - _LASTING_BIAS * usual_v, out=usual)
         before, tau = usual[:-1], usual[1:].copy()
         sudden = square > _SUDDEN * (terms.v + before[:, :reported])

@@ -12,7 +12,7 @@ without a tone is found where readings of two PSDs vary together over a group of
 Noise alone makes a bin exceed its floor T times with probability exp(-T); the floor of 50 neighbours is uncertain by
 1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 40 in some thousand hours.
 Slow motion is kept out by a Hann window (periodic), whose lobes fall as the cube of the distance; gaps are bridged by
-straight lines, so that a regular gap makes no tone of a slow motion.
+cubics, so that a regular gap makes no tone of a slow motion.
 
 What a tone of variance P does to an answer w^T z that is meant for the block's middle is known: it leaves |1 - H|^2 P,
 H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings, and
@@ -176,7 +176,10 @@ class ToneSearch:
             # The quietest group has the noise alone, or hardly more.
             noise = np.median(self._grouped(power[:, :count]), axis=1).min(axis=0) / _LN_2
             covariance = self._cross_spectrum(spectrum[None, band, :count] * free[band, None])[0]
-            covariance[range(count), range(count)] -= np.count_nonzero(free[band]) * noise
+            # Each combination less its noise; scaled, so that it stays a covariance.
+            total = np.diagonal(covariance) + _LEAST
+            signal = np.sqrt(np.maximum(1.0 - np.count_nonzero(free[band]) * noise / total, 0.0))
+            covariance = signal[:, None] * covariance * signal
             frequency = 0.5 * (band.start + band.stop - 1) / self._length
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', combinations, scale * covariance, combinations)))
         return Tones(tuple(out), tuple(hum))
@@ -236,14 +239,34 @@ _LEAST = 1e-27
 
 
 def _filled(places: IntArray, series: FloatArray, length: int) -> FloatArray:
-    """``series`` (n, c) at ``places`` (n,) as (length, c): straight lines across gaps, constant at the ends."""
+    """Return ``series`` (n, c) at ``places`` (n,) as (length, c): cubics across gaps, constant at the ends.
+
+    A cubic goes through the samples at both sides of a gap, and those as far from them as the gap is wide.
+    """
     if len(places) == length:
         return series
-    at = np.arange(length)
-    after = np.clip(np.searchsorted(places, at), 1, len(places) - 1)
+    out = np.empty((length, series.shape[1]))
+    out[: places[0]], out[places[-1] :] = series[0], series[-1]
+    out[places] = series
+    at = np.setdiff1d(np.arange(places[0], places[-1]), places, assume_unique=True)
+    after = np.searchsorted(places, at)
     before = after - 1
-    share = np.clip((at - places[before]) / (places[after] - places[before]), 0.0, 1.0)
-    return np.asarray(series[before] + share[:, None] * (series[after] - series[before]))
+    width = places[after] - places[before]
+    first = np.maximum(np.searchsorted(places, places[before] - width, 'right') - 1, 0)
+    last = np.minimum(np.searchsorted(places, places[after] + width), len(places) - 1)
+    for inner, knots in (
+        ((first < before) & (last > after), (first, before, after, last)),
+        ((first == before) | (last == after), (before, after)),
+    ):
+        u, x = at[inner].astype(np.float64), [places[k[inner]] for k in knots]
+        out[at[inner]] = 0.0
+        for k, own in zip(knots, x, strict=True):
+            weight = np.ones(len(u))
+            for other in x:
+                if other is not own:
+                    weight *= (u - other) / (own - other)
+            out[at[inner]] += weight[:, None] * series[k[inner]]
+    return out
 
 
 def rms_of(tone: Tone) -> float:
