@@ -271,7 +271,7 @@ def test_what_strangers_send_is_bounded(udp: Datagrammed) -> None:
     # Memory is bounded, and nothing public says how much is kept of a stranger.
     candidates = udp.port._candidates
     assert len(candidates) == MOST_SENDERS
-    assert all(len(one.last_bytes) <= KEPT for one in candidates.values())
+    assert all(len(candidate.last_bytes) <= KEPT for candidate in candidates.values())
     device = udp.sender()
     device.send(b'device')
     assert all_of(udp.port, 6) == b'device'
