@@ -133,12 +133,12 @@ class UdpPort(OpenPort):
 
     def _candidate(self, sender: Any) -> _Candidate:
         """What is known of somebody who may be the sender."""
-        found = self._candidates.get(sender)
-        if found is None:
+        candidate = self._candidates.get(sender)
+        if candidate is None:
             while len(self._candidates) >= MOST_SENDERS:
                 del self._candidates[next(iter(self._candidates))]
-            found = self._candidates[sender] = _Candidate(self._datagrams.validator())
-        return found
+            candidate = self._candidates[sender] = _Candidate(self._datagrams.validator())
+        return candidate
 
     def _other(self, datagram: bytes, sender: Any, now: float) -> None:
         """Count what somebody else sends. Raises PortClosedError if it is a device that follows a silent one."""
@@ -172,8 +172,8 @@ class UdpPort(OpenPort):
 
     def notices(self) -> list[Notice]:
         """That others send, once."""
-        found, self._notices = self._notices, []
-        return found
+        notices, self._notices = self._notices, []
+        return notices
 
     def discard_input(self) -> None:
         """Discard datagrams that were not read: they are older than their time of reading."""
@@ -208,8 +208,8 @@ class _Candidate:
 
 
 def _bound(address: Address) -> socket.socket:
-    found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
-    family, kind, protocol, _, place = found[0]
+    addresses = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
+    family, kind, protocol, _, place = addresses[0]
     made = socket.socket(family, kind, protocol)
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)

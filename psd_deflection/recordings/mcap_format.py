@@ -250,11 +250,11 @@ class _Fields:
     def texts(self) -> dict[str, str]:
         (size,) = self.numbers(_U32)
         end = self._at + size
-        found = {}
+        texts = {}
         while self._at < end:
             name = self.text()
-            found[name] = self.text()
-        return found
+            texts[name] = self.text()
+        return texts
 
 
 def parsed(opcode: int, content: bytes) -> McapRecord:
