@@ -115,7 +115,9 @@ def live_line(session: Session, rate: float) -> str:
     elif estimate is not None:
         pose = estimate.dx, estimate.dy, estimate.theta
         shown = zip(SYMBOLS, pose, estimate.variances, SHOWN, SHOWN_UNITS, strict=True)
-        body = '  '.join(f'{a} {v * by:+9.2f} ± {math.sqrt(var) * by:.2f} {unit}' for a, v, var, by, unit in shown)
+        body = '  '.join(
+            f'{a} {v * factor:+9.2f} ± {math.sqrt(var) * factor:.2f} {unit}' for a, v, var, factor, unit in shown
+        )
     else:
         body = f'no estimate: {spots.reason}' if spots is not None and spots.reason else 'no estimate yet'
     return f'{head}  {body}  {tail}'

@@ -58,11 +58,11 @@ class RigPublisher:
         if self._first is not None:
             first, self._first = self._first, None
             self._untold.append((pipeline.rig, first._replace(block=index)))
-        due = self._due if self._due is not None else index
-        if index < due:
+        next_index = self._due if self._due is not None else index
+        if index < next_index:
             return
         buffered = pipeline.buffers
-        if not buffered or (index >= due + LATE and buffered <= MOST_BUFFERED):
+        if not buffered or (index >= next_index + LATE and buffered <= MOST_BUFFERED):
             self._due = index + self._every
             self._untold.append((pipeline.rig, self._memory()._replace(block=index + 1)))
 

@@ -77,14 +77,14 @@ def run(args: argparse.Namespace) -> int:
         with stage('reading', quiet=args.json):
             observed = read_observation(recording, rig)
         volts = Wiring.from_rig(rig).to_device(observed.volts)
-        found = check(of_recording(rig, volts, observed.loads, args.recording))
+        checkup = check(of_recording(rig, volts, observed.loads, args.recording))
         if not args.json:
             show(f'{args.recording}: {observed.duration:.1f} s')
     else:
         if args.span != FULL:
             raise UsageError('--from, --to: are for a recording: give REC')
-        found = _guided(args)
-    return answer(args, found)
+        checkup = _guided(args)
+    return answer(args, checkup)
 
 
 def _guided(args: argparse.Namespace) -> Checkup:
@@ -95,9 +95,9 @@ def _guided(args: argparse.Namespace) -> Checkup:
     if rig.acquisition.port:
         reject(args, {'world': []}, 'is for the simulated rig: give no --port')
     shown = GuideDisplay(quiet=args.json)
-    found = run_guided(rig, in_the_world(rig, args.world), texts(shown.log), shown.update)
+    checkup = run_guided(rig, in_the_world(rig, args.world), texts(shown.log), shown.update)
     shown.end()
-    return found
+    return checkup
 
 
 class GuideDisplay:
