@@ -72,9 +72,9 @@ def launch(domain: int) -> Iterator[Callable[..., Program]]:
         return started[-1]
 
     yield begin
-    for one in started:
-        one.end(signal.SIGTERM)
-        print(*one.lines[-50:], sep='\n')
+    for child in started:
+        child.end(signal.SIGTERM)
+        print(*child.lines[-50:], sep='\n')
 
 
 @pytest.fixture
@@ -183,8 +183,8 @@ class Peer:
 
 @pytest.fixture
 def peer(domain: int) -> Iterator[Peer]:
-    with contextlib.closing(Peer()) as one:
-        yield one
+    with contextlib.closing(Peer()) as made:
+        yield made
 
 
 @pytest.fixture(scope='session')

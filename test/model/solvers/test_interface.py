@@ -274,11 +274,11 @@ def test_the_residual_is_that_at_the_answer_to_the_last_digit() -> None:
     """Readings that no curve explains: each step is a share of the one before, and the last one still counts."""
     on, _ = curve((2.0, 0.3))
     measured = [a + b for a, b in zip(on, (0.9, -0.7, 0.8), strict=True)]
-    one = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
-    assert one.converged
-    assert one.steps > 5
-    want = np.array(measured) - curve(one.parameters)[0]
-    np.testing.assert_allclose(one.residual, want, rtol=0.0, atol=2e-15)
+    fitted = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
+    assert fitted.converged
+    assert fitted.steps > 5
+    want = np.array(measured) - curve(fitted.parameters)[0]
+    np.testing.assert_allclose(fitted.residual, want, rtol=0.0, atol=2e-15)
 
 
 def test_an_answer_takes_the_first_three_of_five() -> None:
