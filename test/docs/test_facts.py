@@ -77,7 +77,7 @@ def test_defaults_of_the_shaper_are_on_its_page(name: str) -> None:
 def test_defaults_of_the_camera_are_on_its_page() -> None:
     stated = rows('camera.md')
     declared = Section(CameraSettings).parameters
-    for names in (('spacing', 'radius'), ('square', 'marker', 'gap'), ('turn',), ('exposure',), ('rest_frames',)):
+    for names in (('spacing', 'radius'), ('square', 'marker', 'gap'), ('rotation',), ('exposure',), ('rest_frames',)):
         given = [float(number) for number in stated[declared[names[0]].name][1].split(', ')]
         assert given == [declared[name].default for name in names]
 
