@@ -197,7 +197,7 @@ def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
 
 
 def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: float = 10.0) -> ImpliedLoads:
-    """Plateaus of 2 s under one annotated load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
+    """Holds of 2 s under one annotated load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
     rows = np.array([(0.0, y, 0.0) for y in more])
     listed = tuple(
         Hold(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, annotated, 0.0))) for i in range(len(more))
