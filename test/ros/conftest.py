@@ -132,13 +132,13 @@ class Peer:
 
     def until_sent(self, send: Callable[[], object], condition: Callable[[], bool], what: str) -> None:
         """Until ``condition``; ``send`` is called at once and each ``SEND_AGAIN_S``."""
-        due = -math.inf
+        next_time = -math.inf
 
         def sent() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
+            nonlocal next_time
+            if time.monotonic() >= next_time:
                 send()
-                due = time.monotonic() + SEND_AGAIN_S
+                next_time = time.monotonic() + SEND_AGAIN_S
             return condition()
 
         self.until(sent, what)

@@ -173,7 +173,7 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     changes[0, 300:700, 1] = changes[1, 500:, 0] = 1.0
     changes[1, 500:, 1] = 0.7
     free = tuple(LoadDirection(0, changes[k], float(sd[k]), 'hung', k) for k in range(2))
-    freed = ws.with_free(free)
+    wider = ws.with_free(free)
 
     def shown(loads: FloatArray) -> list[FloatArray]:
         return [fine_means(ForwardModel(o.rig).expect(loads, o.temperature).volts, 4)]
@@ -184,17 +184,17 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     rng = np.random.default_rng(0)
     p, q = (o.rig.noises.ravel()[:, None] * rng.standard_normal(still.shape) for _ in range(2))
     r, s = ws.whiten([p]), ws.whiten([q])
-    assert freed.whiten([p]) @ freed.whiten([q]) == pytest.approx(r @ s - (a.T @ r) @ inverse @ (a.T @ s), rel=1e-6)
+    assert wider.whiten([p]) @ wider.whiten([q]) == pytest.approx(r @ s - (a.T @ r) @ inverse @ (a.T @ s), rel=1e-6)
     sds = np.sqrt(np.diag(inverse))
-    assert freed.direction_sd() == pytest.approx({(id(free[0].of), k): v for k, v in enumerate(sds.tolist())}, rel=1e-6)
+    assert wider.direction_sd() == pytest.approx({(id(free[0].of), k): v for k, v in enumerate(sds.tolist())}, rel=1e-6)
     # Beside what another 3 N and 1 N leave, and only then is it worth a simulation more.
     off = [p + moved - still for moved in shown(o.loads + 3.0 * changes[0] - changes[1])]
     sizes = inverse @ a.T @ ws.whiten(off)
     loads = o.loads + np.tensordot(sizes, changes, 1)
-    for again in (freed.refitted(off), freed.refitted_beside(off, ())):
+    for again in (wider.refitted(off), wider.refitted_beside(off, ())):
         np.testing.assert_allclose(again.observations[0].loads, loads, atol=1e-6)
         assert len(again.directions) == 2
-    assert freed.refitted_beside([np.zeros_like(p)], ()) is freed
+    assert wider.refitted_beside([np.zeros_like(p)], ()) is wider
     assert (ws.direction_sd(), ws.refitted(off), ws.refitted_beside(off, ())) == ({}, ws, ws)
     assert ws.with_free((ZeroDirection(0, 1, 1e-6),)).refitted_beside(off, ()).observations[0] is o
     # Five, of which two make the others: of least norm.
