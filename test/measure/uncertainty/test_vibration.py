@@ -43,10 +43,10 @@ def moving_tones(
 @pytest.mark.parametrize('hz', [26.0, 36.4, 47.0, 87.0, 130.4, 300.0, 480.0])
 def test_a_tone_is_found_with_its_frequency_and_its_covariance(hz: float) -> None:
     amplitudes = np.array([5e-6, -2e-6])
-    (tone_1,) = moving_tones(noise(1) + tone(hz)[:, None] * amplitudes, noise(2))
-    assert tone_1.frequency * RATE == pytest.approx(hz, abs=0.1)
+    (peak,) = moving_tones(noise(1) + tone(hz)[:, None] * amplitudes, noise(2))
+    assert peak.frequency * RATE == pytest.approx(hz, abs=0.1)
     want = TURN.T @ np.outer(amplitudes, amplitudes) @ TURN / 2.0
-    np.testing.assert_allclose(tone_1.covariance, want, rtol=0.05, atol=6e-13)
+    np.testing.assert_allclose(peak.covariance, want, rtol=0.05, atol=6e-13)
 
 
 def test_two_tones_are_two_and_what_does_not_take_part_stays_out() -> None:

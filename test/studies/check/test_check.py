@@ -413,8 +413,8 @@ def test_quantisation_noise_is_step_over_root_12() -> None:
     assert same.value == 3.0
     # Channels that nobody sees have no say, however coarse they are.
     steps[0, 1] = 5.0
-    (finding_3,), _ = shared_findings.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
-    assert finding_3.value == 3.457
+    (partial,), _ = shared_findings.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
+    assert partial.value == 3.457
     assert shared_findings.noise_findings(RIG, np.zeros(4)) == ([], {})
 
 
