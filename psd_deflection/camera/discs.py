@@ -88,17 +88,17 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
             grey[: rows * factor, : columns * factor], (columns, rows), interpolation=opencv().INTER_AREA
         )
         try:
-            regions = _found([next(_binaries(small, smooth=False))], ratio, CLEAR / factor)
+            regions = _best_regions([next(_binaries(small, smooth=False))], ratio, CLEAR / factor)
         except NoPoseError as error:
             if error.status is Status.DOUBLED:
                 raise
         else:
             if min(r.axes[0] for r in regions) > _COARSE_RADIUS:
                 return [r.enlarged(factor) for r in regions]
-    return _found(_binaries(grey), ratio, CLEAR)
+    return _best_regions(_binaries(grey), ratio, CLEAR)
 
 
-def _found(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
+def _best_regions(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
     best: tuple[int, Status] = (0, Status.MISSING)
     for binary in binaries:
         if np.count_nonzero(binary[:, 1:] != binary[:, :-1]) > _MOST_EDGES:

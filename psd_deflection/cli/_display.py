@@ -33,7 +33,7 @@ class Display:
         self._lock = threading.Lock()
         self._last = 0.0
         self._shown = False
-        self._counted = 0
+        self._last_count = 0
         self._recorded: dict[Path, Mapping[Path, str]] = {}
 
     def watch(self, session: Session) -> None:
@@ -83,11 +83,11 @@ class Display:
         if self._last and not self._live:
             # In a journal regular lines are noise; changes have their own messages.
             self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
-        rate = (count - self._counted) / passed if self._last else math.nan
-        if count < self._counted:
+        rate = (count - self._last_count) / passed if self._last else math.nan
+        if count < self._last_count:
             # Another session, which counts from zero.
             rate = math.nan
-        self._last, self._counted = now, count
+        self._last, self._last_count = now, count
         text = line(rate)
         with self._lock:
             self._put(text + ('' if self._live else '\n'), shown=self._live)

@@ -81,7 +81,7 @@ class UdpPort(OpenPort):
         # Before there is one: those that may be it, and what waits to be sent to it.
         self._candidates: dict[Any, _Candidate] = {}  # Bound: MOST_SENDERS.
         self._pending = b''
-        self._others = 0
+        self._other_datagrams = 0
         self._notices: list[Notice] = []  # Bound: one a port: that others send.
 
     def read(self, timeout: float) -> bytes:
@@ -142,8 +142,8 @@ class UdpPort(OpenPort):
 
     def _other(self, datagram: bytes, sender: Any, now: float) -> None:
         """Count what somebody else sends. Raises PortClosedError if it is a device that follows a silent one."""
-        self._others += 1
-        if self._others == 1:
+        self._other_datagrams += 1
+        if self._other_datagrams == 1:
             self._notices.append(
                 Notice(f'datagrams of {_shown(sender)} are not taken: {_shown(self._sender)} sends already')
             )
@@ -186,7 +186,7 @@ class UdpPort(OpenPort):
         sender = self._sender
         return {
             'sender': 'none yet' if sender is None else _shown(sender),
-            'datagrams of other senders': str(self._others),
+            'datagrams of other senders': str(self._other_datagrams),
         }
 
     def close(self) -> None:

@@ -91,7 +91,7 @@ class Recording(abc.ABC):
         self.memories: Sequence[ParameterChange] = ()
         self.restarts: set[tuple[int, int]] = set()
         self.requested_block_size = block_size
-        self._found = Warnings()
+        self._later_warnings = Warnings()
 
     @property
     def namespace(self) -> str:
@@ -187,7 +187,7 @@ class Recording(abc.ABC):
 
     def warn(self, text: str) -> None:
         """Add to ``warnings`` what was found while it was used."""
-        self._found.add(text)
+        self._later_warnings.add(text)
 
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size.

@@ -168,7 +168,7 @@ class _Preview:
         if path is not None and not path.lower().endswith('.png'):
             raise UsageError(f'--show {path}: the name must end in .png')
         self._path = None if path is None else Path(path)
-        self._due = 0.0
+        self._next_time = 0.0
         self._last: tuple[Any, FrameAnswer] | None = None
         if self._path is not None:
             need_folder(self._path)
@@ -179,8 +179,8 @@ class _Preview:
         if self._path is None or not matching:
             return
         self._last = frame.image, matching[-1]
-        if time.monotonic() >= self._due:
-            self._due = time.monotonic() + PREVIEW_S
+        if time.monotonic() >= self._next_time:
+            self._next_time = time.monotonic() + PREVIEW_S
             self.write()
 
     def write(self) -> None:

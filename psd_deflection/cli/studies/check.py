@@ -106,7 +106,7 @@ class GuideDisplay:
     def __init__(self, quiet: bool) -> None:
         self._stream = sys.stderr if quiet else sys.stdout
         self._live = self._stream.isatty()
-        self._turn = 0
+        self._count = 0
 
     def log(self, text: str) -> None:
         """A prompt or a message."""
@@ -115,8 +115,8 @@ class GuideDisplay:
 
     def update(self, guide: Guide) -> None:
         """Show how far the dots have moved, and how long the push has been held."""
-        self._turn += 1
-        if not self._live or self._turn % 5:
+        self._count += 1
+        if not self._live or self._count % 5:
             return
         full = round(guide.progress * BAR)
         moved = '  '.join(f'{c} {v * 1e6:+8.1f}' for c, v in zip(DOTS, guide.moved.tolist(), strict=True))

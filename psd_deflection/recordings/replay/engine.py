@@ -286,14 +286,14 @@ class BufferedEstimates:
     """The primary estimates and tip loads among the records of a replay."""
 
     def __init__(self) -> None:
-        self._found: list[DeflectionEstimate] = []
+        self._estimates: list[DeflectionEstimate] = []
         self._wrenches: dict[int, TipLoad] = {}
         self._start_ns: int | None = None
 
     def add(self, record: Record) -> None:
         """Take one record."""
         if isinstance(record, DeflectionEstimate) and record.primary:
-            self._found.append(record)
+            self._estimates.append(record)
         elif isinstance(record, TipLoad):
             self._wrenches[record.t_ns] = record
         elif isinstance(record, SampleBlock) and self._start_ns is None:
@@ -301,7 +301,7 @@ class BufferedEstimates:
 
     def series(self) -> EstimateSeries:
         """All of them so far."""
-        estimates = self._found
+        estimates = self._estimates
         nothing = TipLoad(0, np.nan, np.nan, np.nan)
         return EstimateSeries(
             DEFLECTION,

@@ -77,7 +77,7 @@ class _Processes:
 
     def __init__(self, count: int) -> None:
         self.slots = count
-        self._others = set(multiprocessing.active_children())
+        self._previous = set(multiprocessing.active_children())
         self._pool = self._made()
 
     def _made(self) -> ProcessPoolExecutor:
@@ -104,7 +104,7 @@ class _Processes:
 
     def kill(self) -> None:
         """End the processes at once."""
-        for process in set(multiprocessing.active_children()) - self._others:
+        for process in set(multiprocessing.active_children()) - self._previous:
             process.terminate()
         self._pool.shutdown(cancel_futures=True)
 
