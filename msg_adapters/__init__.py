@@ -369,7 +369,7 @@ def messages(record: Record, frame_prefix: str = '') -> Iterator[Message]:
 
 def from_fields(topic: str, fields: Mapping[str, Any]) -> Input:
     """The record of a message on one of ``INPUTS``. Raises ValueError for another topic, and if it cannot be used."""
-    found = BY_NAME.get(topic)
-    if found is None or found.to_record is None:
+    entry = BY_NAME.get(topic)
+    if entry is None or entry.to_record is None:
         raise ValueError(f'{topic} is not an input')
-    return found.to_record(fields)
+    return entry.to_record(fields)

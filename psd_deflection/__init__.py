@@ -153,10 +153,12 @@ def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str 
             f'dots{bad[0].tolist()} = {rows[at]:g} m: must be at most {widths[at[-1]]:g} m, the width of its detector'
         )
     method = solver_from_rig(known.estimator.solver if solver is None else solver, known)
-    found = method.solve_many(np.atleast_2d(rows), dot_noise_variances(known) / known.estimator.block_size)
+    solutions = method.solve_many(np.atleast_2d(rows), dot_noise_variances(known) / known.estimator.block_size)
     if rows.ndim == 2:
-        return found
-    return dataclasses.replace(found, **{f.name: getattr(found, f.name)[0] for f in dataclasses.fields(found)})
+        return solutions
+    return dataclasses.replace(
+        solutions, **{f.name: getattr(solutions, f.name)[0] for f in dataclasses.fields(solutions)}
+    )
 
 
 def simulate(

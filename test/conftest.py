@@ -71,7 +71,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     grouped = items if getattr(config.option, 'loadgroup', False) else []
     for item in grouped:
         if isinstance(item, pytest.Function):
-            scopes = {one.scope for made in item._fixtureinfo.name2fixturedefs.values() for one in made}
+            scopes = {fixture.scope for made in item._fixtureinfo.name2fixturedefs.values() for fixture in made}
             if 'module' in scopes:
                 item.add_marker(pytest.mark.xdist_group(item.nodeid.partition('::')[0]))
 

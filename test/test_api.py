@@ -85,11 +85,11 @@ def test_dots_of_one_block_and_of_many() -> None:
     for name in ('exact', 'wls', 'beam'):
         solved = psd_deflection.solve(many, rig, name)
         assert solved.pose.shape == (5, 3)
-        one = psd_deflection.solve(many[2].tolist(), rig, name)
-        assert [getattr(one, f).shape for f in ('pose', 'tilt', 'covariance', 'residual', 'status')] == [
+        single = psd_deflection.solve(many[2].tolist(), rig, name)
+        assert [getattr(single, f).shape for f in ('pose', 'tilt', 'covariance', 'residual', 'status')] == [
             (3,), (2,), (3, 3), (4,), (),
         ]  # fmt: skip
-        assert np.array_equal(one.pose, solved.pose[2])
+        assert np.array_equal(single.pose, solved.pose[2])
     # A pure translation moves both dots alike, the other way.
     assert psd_deflection.solve([-1e-3, 2e-3, -1e-3, 2e-3], solver='ols').pose == pytest.approx([1e-3, -2e-3, 0.0])
 
@@ -104,22 +104,22 @@ def test_a_simulated_recording_is_a_recording() -> None:
     estimates = psd_deflection.replay(run)
     truth = np.stack([np.interp(estimates.t, run.samples['t'], run.pose[:, i]) for i in range(3)], axis=1)
     # The flat plate of the simulation is what the method assumes; the rest is the step inside a block.
-    settled = np.abs(estimates.t - 1.5) > 0.05
-    assert np.abs(estimates.pose - truth)[settled].max() < 1e-5
-    one, again, other = (psd_deflection.simulate(rig, 'thesis:0.5', seed=seed).samples['y1'] for seed in (1, 1, 2))
-    assert np.array_equal(one, again)
-    assert not np.array_equal(one, other)
+    steady = np.abs(estimates.t - 1.5) > 0.05
+    assert np.abs(estimates.pose - truth)[steady].max() < 1e-5
+    first, again, other = (psd_deflection.simulate(rig, 'thesis:0.5', seed=seed).samples['y1'] for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
 
 
 def test_hidden_effects_are_not_named(tmp_path: Path) -> None:
-    own = tmp_path / 'rig.yaml'
-    own.write_text('/**:\n  ros__parameters:\n    effects:\n      sensor_gain: {psd: 1, x: 0.01}\n')
+    rig_file = tmp_path / 'rig.yaml'
+    rig_file.write_text('/**:\n  ros__parameters:\n    effects:\n      sensor_gain: {psd: 1, x: 0.01}\n')
     load = (0.0, -30.0, -17.0)
-    as_map = psd_deflection.simulate(own, load, {'sensor_gain': {'psd': 2, 'y': 0.037}}, seconds=0.1, seed=4)
-    as_words = psd_deflection.simulate(own, load, 'sensor_gain,psd=2,y=0.037', seconds=0.1, seed=4)
+    as_map = psd_deflection.simulate(rig_file, load, {'sensor_gain': {'psd': 2, 'y': 0.037}}, seconds=0.1, seed=4)
+    as_words = psd_deflection.simulate(rig_file, load, 'sensor_gain,psd=2,y=0.037', seconds=0.1, seed=4)
     assert np.array_equal(as_map.samples['y2'], as_words.samples['y2'])
     assert not np.array_equal(
-        as_map.samples['y2'], psd_deflection.simulate(own, load, seconds=0.1, seed=4).samples['y2']
+        as_map.samples['y2'], psd_deflection.simulate(rig_file, load, seconds=0.1, seed=4).samples['y2']
     )
     assert set(as_map.known.effects) == {'sensor_gain.psd', 'sensor_gain.x'}
     assert 0.037 not in as_map.parameters.values()
@@ -132,10 +132,10 @@ def test_discover_takes_what_simulate_gives() -> None:
         seconds=0.6,
         effects='sensor_gain,psd=1,y=0.02',
     )
-    found = psd_deflection.discover([run])
-    assert isinstance(found, Discovery)
-    assert [e.active.effect.name for e in found.effects] == ['sensor_gain']
-    assert repr(found).startswith('<Discovery effects_found: sensor_gain (psd 1); gap ')
+    discovery = psd_deflection.discover([run])
+    assert isinstance(discovery, Discovery)
+    assert [e.active.effect.name for e in discovery.effects] == ['sensor_gain']
+    assert repr(discovery).startswith('<Discovery effects_found: sensor_gain (psd 1); gap ')
 
 
 @pytest.mark.parametrize(

@@ -26,11 +26,11 @@ CONFIG = ROOT / 'config'
 @pytest.fixture(scope='module')
 def recorded() -> dict[str, Any]:
     """One message of each topic of a recording, decoded."""
-    found: dict[str, Any] = {}
+    messages: dict[str, Any] = {}
     for message in open_recording(ROOT / 'bags' / 'clean').messages():
-        if message.channel.topic not in found:
-            found[message.channel.topic] = cdr.decode(message.channel.type, message.cdr)
-    return found
+        if message.channel.topic not in messages:
+            messages[message.channel.topic] = cdr.decode(message.channel.type, message.cdr)
+    return messages
 
 
 def field_of(fields: Any, path: str) -> float:

@@ -158,16 +158,16 @@ def run(rig: Rig, spoil: Spoil | None = None) -> tuple[list[Record], FloatArray,
 
 def deviations(records: Sequence[Record], truth: FloatArray) -> FloatArray:
     """|error| over its own standard deviation, (n, 3), of the primary estimates."""
-    found = primaries(records)
-    errors = np.array([e.pose for e in found]) - truth[[e.block for e in found]]
-    return np.asarray(np.abs(errors) / np.sqrt([e.variances for e in found]))
+    estimates = primaries(records)
+    errors = np.array([e.pose for e in estimates]) - truth[[e.block for e in estimates]]
+    return np.asarray(np.abs(errors) / np.sqrt([e.variances for e in estimates]))
 
 
 def assert_inside(records: Sequence[Record], truth: FloatArray) -> None:
     """As good as two PSDs while the link rings: 99 % within three standard deviations, none far out."""
-    found = deviations(records, truth)
-    assert (found < 3.0).mean() > 0.99
-    assert found.max() < 6.0
+    ratios = deviations(records, truth)
+    assert (ratios < 3.0).mean() > 0.99
+    assert ratios.max() < 6.0
 
 
 @pytest.mark.slow
@@ -178,8 +178,8 @@ def test_without_one_psd_the_estimate_goes_on_from_the_others(
 ) -> None:
     rig = with_solver(three, solver, **more)
     records, truth, pipeline = run(rig, fault(psd))
-    found, spots = primaries(records), spots_of(records)
-    assert len(found) == len(spots) == 180
+    estimates, spots = primaries(records), spots_of(records)
+    assert len(estimates) == len(spots) == 180
     assert_inside(records, truth)
     after = [s for s in spots if s.index * 20 >= FAILS]
     assert {s.excluded for s in after} == {(psd + 1,)}
@@ -187,9 +187,9 @@ def test_without_one_psd_the_estimate_goes_on_from_the_others(
     assert pipeline.counters.degraded == len(after) == 90
     assert sum(isinstance(r, TipLoad) for r in records) == 180
     # What is left says less, and its own check has two degrees of freedom less: one, or none.
-    before = np.mean([e.variances for e in found[50:90]], axis=0)
-    assert (np.mean([e.variances for e in found[-50:]], axis=0) > 1.1 * before).all()
-    squares = np.array([e.chi_square for e in found[-80:]])
+    before = np.mean([e.variances for e in estimates[50:90]], axis=0)
+    assert (np.mean([e.variances for e in estimates[-50:]], axis=0) > 1.1 * before).all()
+    squares = np.array([e.chi_square for e in estimates[-80:]])
     assert np.isnan(squares).all() if solver == 'pose' else 0.5 < squares.mean() < 1.6
     topics = {m.topic for m in to_messages(after[-1])}
     assert topics == {f'/psd_{n}/spot' for n in (1, 2, 3) if n != psd + 1}
@@ -202,8 +202,8 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
 ) -> None:
     rig = with_solver(three, 'exact', **LEVEL)
     records, truth, pipeline = run(rig, fault(psd))
-    found, spots = primaries(records), spots_of(records)
-    assert len(found) == 180
+    estimates, spots = primaries(records), spots_of(records)
+    assert len(estimates) == 180
     assert_inside(records, truth)
     excluded = [s.excluded for s in spots if s.index * 20 >= FAILS]
     assert excluded.count((psd + 1,)) > 30
@@ -211,7 +211,7 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     assert not any(s.excluded for s in spots if s.index * 20 < FAILS)
     assert pipeline.estimator.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
     assert f'psd_{psd + 1} contradicts the others and is left out' in pipeline.counters.findings
-    good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.excluded]
+    good = [e.chi_square for e, s in zip(estimates, spots, strict=True) if s.excluded]
     assert np.mean(good) < 2.0
 
 
@@ -287,9 +287,9 @@ def test_each_of_three_may_be_the_last(three: Rig, psd: int) -> None:
     counts = at_rest(rig, np.tile([-1e-3, 2e-3], 3), 20, 1)
     for other in {0, 1, 2} - {psd}:
         counts[:, 3 * other : 3 * other + 3] = 0
-    (found,) = primaries(list(Pipeline(rig).process(chunk(counts))))
-    assert found.solver == 'one_psd'
-    assert found.pose == pytest.approx((1e-3, -2e-3, 0.0), abs=2e-6)
+    (estimate,) = primaries(list(Pipeline(rig).process(chunk(counts))))
+    assert estimate.solver == 'one_psd'
+    assert estimate.pose == pytest.approx((1e-3, -2e-3, 0.0), abs=2e-6)
 
 
 def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
@@ -317,8 +317,8 @@ def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solv
         volts[:, 3 * psd : 3 * psd + 2] = dots[:, 2 * psd : 2 * psd + 2] / 5e-4
     noisy = volts + np.random.default_rng(0).normal(0.0, 2e-3, volts.shape)
     counts = np.rint(noisy / COUNT).astype(np.int32)
-    found = primaries(list(Pipeline(with_solver(three, solver)).process(chunk(counts))))[200:]
-    off = np.abs([e.pose for e in found]) / np.sqrt([e.variances for e in found])
+    estimates = primaries(list(Pipeline(with_solver(three, solver)).process(chunk(counts))))[200:]
+    off = np.abs([e.pose for e in estimates]) / np.sqrt([e.variances for e in estimates])
     assert off.max() < 7.0
     assert (off < 1.96).mean(axis=0).min() > 0.93
 
@@ -393,9 +393,9 @@ def test_a_zero_is_of_all_psds(three: Rig) -> None:
     list(pipeline.process(chunk(counts)))
     taken = pipeline.zero()
     assert taken is not None
-    found = dict(taken.values)
+    values = dict(taken.values)
     for name, wanted in zeros.items():
-        assert found[name] == pytest.approx(wanted, abs=1e-6)
+        assert values[name] == pytest.approx(wanted, abs=1e-6)
     assert [e.pose for e in primaries(list(pipeline.process(chunk(counts, 600))))][-1] == pytest.approx(
         (0.0, 0.0, 0.0), abs=5e-6
     )

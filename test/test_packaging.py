@@ -38,10 +38,10 @@ def installed_files() -> dict[str, Path]:
     """What pip installed, by the path below the environment; skips where the tests run off a checkout."""
     # Of the environment, not of the checkout that we run in.
     where = [sysconfig.get_path('purelib')]
-    found = list(importlib.metadata.distributions(name='psd_deflection', path=where))
-    if not found:
+    distributions = list(importlib.metadata.distributions(name='psd_deflection', path=where))
+    if not distributions:
         pytest.skip('psd_deflection is not installed here; `make test` installs it')
-    (distribution,) = found
+    (distribution,) = distributions
     prefix = Path(sys.prefix).resolve()
     located = (Path(str(distribution.locate_file(f))).resolve() for f in distribution.files or ())
     return {str(p.relative_to(prefix)): p for p in located if p.is_relative_to(prefix)}
@@ -132,8 +132,8 @@ def imported(*folders: str) -> set[str]:
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module.partition('.')[0])
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and 'test' not in folders:
-                found = re.fullmatch(r'(\w+)(?:/(?:msg|action)/\w+|\.msg)', node.value)
-                names |= {found[1]} if found else set()
+                match = re.fullmatch(r'(\w+)(?:/(?:msg|action)/\w+|\.msg)', node.value)
+                names |= {match[1]} if match else set()
     always, extras = requirements()
     keyless = {name for name, key in tables()[0].items() if not key.startswith('python3-')}
     names -= {*sys.stdlib_module_names, *UNNAMED, *(IMPORTED_AS.get(n, n) for n in (*extras, *keyless))}
@@ -217,8 +217,8 @@ def test_every_extra_that_is_asked_for_is_there() -> None:
     for file in files:
         if file.suffix in ('.md', '.yml', '.yaml', '.py', ''):
             text = file.read_text(encoding='utf-8', errors='replace')
-            found = re.findall(r'(?:psd[-_]deflection|\.whl"?\)?|[\'" ]\.)\[([a-z,]+)\]', text)
-            asked |= {extra: file.name for group in found for extra in group.split(',')}
+            groups = re.findall(r'(?:psd[-_]deflection|\.whl"?\)?|[\'" ]\.)\[([a-z,]+)\]', text)
+            asked |= {extra: file.name for group in groups for extra in group.split(',')}
     assert {'ros', 'monitor', 'camera'} <= set(asked)
     assert {extra: name for extra, name in asked.items() if extra not in setup['options.extras_require']} == {}
 

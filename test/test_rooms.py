@@ -24,7 +24,7 @@ def test_no_class_name_stands_for_two_things() -> None:
                 if isinstance(node, ast.ClassDef):
                     places[node.name].append(str(path.relative_to(ROOT)))
     assert len(places) > 300
-    assert {name: found for name, found in places.items() if len(found) > 1} == {}
+    assert {name: modules for name, modules in places.items() if len(modules) > 1} == {}
 
 
 def test_each_mutant_made_by_hand_changes_a_line_of_a_room() -> None:
@@ -48,9 +48,9 @@ def test_what_others_can_make_grow_names_its_bound(room: str) -> None:
     for path in sorted((PACKAGE / room).rglob('*.py')):
         text = path.read_text()
         lines, nodes = text.splitlines(), list(ast.walk(ast.parse(text)))
-        kept = [(name, node.lineno) for node in nodes if isinstance(node, ast.stmt) for name in _kept(node)]
-        bounded = {name for name, line in kept if 'Bound: ' in ''.join(lines[max(line - 2, 0) : line + 1])}
-        growing = {name for name, _ in kept} & {name for node in nodes for name in _grown(node)}
+        containers = [(name, node.lineno) for node in nodes if isinstance(node, ast.stmt) for name in _kept(node)]
+        bounded = {name for name, line in containers if 'Bound: ' in ''.join(lines[max(line - 2, 0) : line + 1])}
+        growing = {name for name, _ in containers} & {name for node in nodes for name in _grown(node)}
         assert growing <= bounded, path
 
 

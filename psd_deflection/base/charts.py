@@ -161,13 +161,13 @@ class Panel:
     def curves(self) -> list[Series]:
         """``series`` as they are drawn: over time a line breaks where values are missing."""
         timed = isinstance(self.over, TimeAxis)
-        return [one.broken() if timed or one.after_gap is not None else one for one in self.series]
+        return [curve.broken() if timed or curve.after_gap is not None else curve for curve in self.series]
 
     def marked(self, words: bool) -> list[Rule]:
         """``rules``, and the marks of the axis of time among the points; with their ``words``, if these are wanted."""
         if not isinstance(self.over, TimeAxis) or not self.over.marks:
             return list(self.rules)
-        x = np.concatenate([one.x for one in self.series])
+        x = np.concatenate([curve.x for curve in self.series])
         low, high = np.nanmin(x, initial=np.inf), np.nanmax(x, initial=-np.inf)
         shown = [mark for mark in self.over.marks if low <= mark.t <= high]
         return [*self.rules, *(Rule(m.t, m.text if words and i < MOST_WORDS else '') for i, m in enumerate(shown))]
@@ -201,7 +201,7 @@ def drawn(chart: Chart) -> str:
         notes |= dict.fromkeys(message)
         panels.append(
             {
-                'series': [_reported(one, columns) for one in series],
+                'series': [_reported(curve, columns) for curve in series],
                 'x': panel.x_label,
                 'y': panel.y_label,
                 'log': panel.log,
@@ -249,29 +249,29 @@ def _reported(series: Series, columns: dict[str, int]) -> dict[str, Any]:
 
 def thinned(series: Sequence[Series]) -> tuple[list[Series], Iterable[str]]:
     """What of ``series`` can be seen, and what was done, in words. Curves over the same x stay so."""
-    kept: dict[bytes, npt.NDArray[np.intp]] = {}
+    indices: dict[bytes, npt.NDArray[np.intp]] = {}
     message: dict[str, None] = {}
     for key, group in _by_x(series).items():
-        x, rows = group[0].x, [one.y for one in group]
+        x, rows = group[0].x, [curve.y for curve in group]
         if len(x) <= 2 * BUCKETS:
-            kept[key] = np.arange(len(x))
+            indices[key] = np.arange(len(x))
         elif np.all(np.diff(x) >= 0.0) and len(np.unique(x)) > len(x) // 2:
-            kept[key] = _extremes(rows)
+            indices[key] = _extremes(rows)
             message[f'of every {len(x) / BUCKETS:.3g} points the least and the largest are drawn'] = None
         else:
-            kept[key] = _apart(x, rows)
-            message[f'{len(kept[key])} of {len(x)} points are drawn'] = None
-    return [_of(one, kept[_key(one)]) for one in series], message
+            indices[key] = _apart(x, rows)
+            message[f'{len(indices[key])} of {len(x)} points are drawn'] = None
+    return [_of(curve, indices[_key(curve)]) for curve in series], message
 
 
-def _key(one: Series) -> bytes:
-    return one.x.tobytes()
+def _key(curve: Series) -> bytes:
+    return curve.x.tobytes()
 
 
 def _by_x(series: Sequence[Series]) -> dict[bytes, list[Series]]:
     out: dict[bytes, list[Series]] = {}
-    for one in series:
-        out.setdefault(_key(one), []).append(one)
+    for curve in series:
+        out.setdefault(_key(curve), []).append(curve)
     return out
 
 
@@ -308,6 +308,6 @@ def _cells(values: FloatArray, count: int) -> FloatArray:
     return np.nan_to_num(np.floor((values - low) / reach * (count - 1)))
 
 
-def _of(one: Series, at: npt.NDArray[np.intp]) -> Series:
-    half_width = None if one.half_width is None else one.half_width[at]
-    return replace(one, x=one.x[at], y=one.y[at], half_width=half_width)
+def _of(curve: Series, at: npt.NDArray[np.intp]) -> Series:
+    half_width = None if curve.half_width is None else curve.half_width[at]
+    return replace(curve, x=curve.x[at], y=curve.y[at], half_width=half_width)

@@ -107,15 +107,15 @@ def _bars(bars: Bars) -> str:
 def _matrix(matrix: Matrix) -> str:
     words, values, most, height = matrix.words, matrix.values, matrix.most, matrix.height
     rows, columns = matrix.rows, matrix.columns
-    left, top = 10 + LETTER * max(map(len, rows)), 10 + LETTER * max(map(len, columns))
-    width, tall = left + CELL * len(columns) + 6, top + height * len(rows) + 6
+    x0, y0 = 10 + LETTER * max(map(len, rows)), 10 + LETTER * max(map(len, columns))
+    width, tall = x0 + CELL * len(columns) + 6, y0 + height * len(rows) + 6
     drawn = [
-        f'<text x="{left - 4:.0f}" y="{top + height * (i + 0.5) + 3:.1f}" text-anchor="end">{html.escape(name)}</text>'
+        f'<text x="{x0 - 4:.0f}" y="{y0 + height * (i + 0.5) + 3:.1f}" text-anchor="end">{html.escape(name)}</text>'
         for i, name in enumerate(rows)
         if name
     ]
     drawn += [
-        f'<text transform="translate({left + CELL * (i + 0.5) + 3:.1f},{top - 4:.0f})rotate(-90)">'
+        f'<text transform="translate({x0 + CELL * (i + 0.5) + 3:.1f},{y0 - 4:.0f})rotate(-90)">'
         f'{html.escape(name)}</text>'
         for i, name in enumerate(columns)
         if name
@@ -125,11 +125,11 @@ def _matrix(matrix: Matrix) -> str:
         path = ''.join(f'M{i} {row}h{n}v1h-{n}z' for row, i, n in _runs(levels, level))
         tone = 'blue' if level > 0 else 'red'
         drawn.append(
-            f'<path transform="translate({left:.0f},{top:.0f})scale({CELL},{height})" shape-rendering="crispEdges" '
+            f'<path transform="translate({x0:.0f},{y0:.0f})scale({CELL},{height})" shape-rendering="crispEdges" '
             f'style="fill:var(--{tone})" fill-opacity="{abs(level) / LEVELS:.2f}" d="{path}"/>'
         )
     drawn.append(
-        f'<path fill="none" style="stroke:var(--line)" d="M{left:.0f} {top:.0f}h{CELL * len(columns)}'
+        f'<path fill="none" style="stroke:var(--line)" d="M{x0:.0f} {y0:.0f}h{CELL * len(columns)}'
         f'v{height * len(rows)}h-{CELL * len(columns)}z"/>'
     )
     return wide(
@@ -141,9 +141,9 @@ def _matrix(matrix: Matrix) -> str:
 
 def _runs(levels: np.ndarray[tuple[int, ...], np.dtype[np.int_]], level: int) -> Iterator[tuple[int, int, int]]:
     """Row, first column and number of neighbouring cells of one level."""
-    for row, own in enumerate((levels == level).tolist()):
+    for row, cells in enumerate((levels == level).tolist()):
         at = 0
-        for there, group in itertools.groupby(own):
+        for there, group in itertools.groupby(cells):
             count = len(list(group))
             if there:
                 yield row, at, count

@@ -115,8 +115,8 @@ def _chart(chart: Chart) -> ShownFigure:
 
 def _draw(axis: Any, panel: Panel, rules: list[Rule]) -> None:
     series, _ = thinned(panel.curves)
-    for one in series:
-        _curve(axis, one)
+    for curve in series:
+        _curve(axis, curve)
     for i, rule in enumerate(rules):
         line = axis.axhline if rule.across else axis.axvline
         line(rule.at, color=TONES[rule.colour], lw=0.8, ls='--')
@@ -134,21 +134,21 @@ def _draw(axis: Any, panel: Panel, rules: list[Rule]) -> None:
         axis.set_ylim(*panel.y_range)
     axis.set(xlabel=panel.x_label, ylabel=panel.y_label)
     axis.grid(alpha=0.25)
-    if any(one.name for one in panel.series):
+    if any(curve.name for curve in panel.series):
         axis.legend(loc='best', ncols=3, frameon=False, fontsize=9)
 
 
-def _curve(axis: Any, one: Series) -> None:
-    tone = TONES[one.colour]
+def _curve(axis: Any, curve: Series) -> None:
+    tone = TONES[curve.colour]
     styles: dict[str, dict[str, Any]] = {
-        'line': {'lw': 2.2 if one.bold else 1.0},
+        'line': {'lw': 2.2 if curve.bold else 1.0},
         'points': {'ls': 'none', 'marker': '.', 'ms': 3},
         'rings': {'ls': 'none', 'marker': 'o', 'ms': 4, 'mfc': 'none'},
     }
-    axis.plot(one.x, one.y, color=tone, label=one.name or None, **styles[one.style])
-    if one.half_width is None:
+    axis.plot(curve.x, curve.y, color=tone, label=curve.name or None, **styles[curve.style])
+    if curve.half_width is None:
         return
-    if one.style == 'line':
-        axis.fill_between(one.x, one.y - one.half_width, one.y + one.half_width, color=tone, alpha=0.2, lw=0)
+    if curve.style == 'line':
+        axis.fill_between(curve.x, curve.y - curve.half_width, curve.y + curve.half_width, color=tone, alpha=0.2, lw=0)
     else:
-        axis.errorbar(one.x, one.y, np.abs(one.half_width), fmt='none', ecolor=tone, lw=1)
+        axis.errorbar(curve.x, curve.y, np.abs(curve.half_width), fmt='none', ecolor=tone, lw=1)

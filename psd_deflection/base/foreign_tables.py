@@ -162,10 +162,10 @@ def _begin(lines: Sequence[str]) -> tuple[int, int, str]:
             width = _width(line, separator)
             if width < (4 if separator == ' ' else 1) or _numbers(line, separator):
                 continue
-            below = [one for one in lines[i + 1 : i + 1 + BELOW] if one.strip()]
-            if any(_width(one, separator) != width for one in below):
+            below = [row for row in lines[i + 1 : i + 1 + BELOW] if row.strip()]
+            if any(_width(row, separator) != width for row in below):
                 continue
-            numbers = [_numbers(one, separator) for one in below]
+            numbers = [_numbers(row, separator) for row in below]
             units = numbers.index(True) if True in numbers else BELOW
             if units <= 2 and all(numbers[units:]):
                 return i + 1, units, separator
@@ -181,9 +181,9 @@ def _numbers(line: str, separator: str) -> bool:
 
 def shell_line(path: PurePath, stages: Sequence[str]) -> str:
     """``stages`` as one line of the shell that reads ``path`` and writes ``OUT``."""
-    first, *others = stages
+    first, *rest = stages
     head = f'{first} < {quoted(path)}'
-    return ' | '.join([head, *others]) + f' > {OUT}'
+    return ' | '.join([head, *rest]) + f' > {OUT}'
 
 
 def _plain(name: str) -> str:
@@ -195,15 +195,15 @@ def _plain(name: str) -> str:
 def meant(names: Sequence[str], lacking: Collection[str]) -> list[Meant]:
     """Which of ``names`` probably are the columns ``lacking``, each once, in order."""
     by_plain = {_plain(ours): ours for ours in lacking}
-    for ours, others in SYNONYMS.items():
+    for ours, synonyms in SYNONYMS.items():
         if ours in lacking:
-            by_plain |= dict.fromkeys(others, ours)
+            by_plain |= dict.fromkeys(synonyms, ours)
     out: list[Meant] = []
     taken: set[str] = set()
     for name in names:
         plain = _plain(name)
-        near = did_you_mean(plain, by_plain) if len(plain) > 3 else ''
-        ours = by_plain.get(plain) or (by_plain[near[len('; did you mean ') : -1]] if near else '')
+        hint = did_you_mean(plain, by_plain) if len(plain) > 3 else ''
+        ours = by_plain.get(plain) or (by_plain[hint[len('; did you mean ') : -1]] if hint else '')
         if ours and ours not in taken and name != ours:
             taken.add(ours)
             unit = _UNIT.search(name)
@@ -230,7 +230,7 @@ def what_of_header(
         header = ','.join(ours.get(name, name) for name in names)
         scaled = [(names.index(m.name), m.unit.rpartition(' ')[2]) for m in guesses if m.unit]
         if re.fullmatch(r'[\w., -]+', header):
-            cells = ''.join(f' ${i + 1} = sprintf("%.9f", ${i + 1} / {by});' for i, by in scaled)
+            cells = ''.join(f' ${i + 1} = sprintf("%.9f", ${i + 1} / {factor});' for i, factor in scaled)
             awk = f'awk -F, -v OFS=, \'NR == 1 {{$0 = "{header}"}} NR > 1 && NF {{{cells.strip()}}} 1\''
             line = shell_line(path, [awk if scaled else f"sed '1s/.*/{header}/'"])
             words += f' `{line}` renames them{" and changes their units" if scaled else ""}'

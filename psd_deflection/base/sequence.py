@@ -67,9 +67,9 @@ class SequenceExtender:
         if 0 < ahead < self._reach(t_device_us - self._last_time):
             self._last, self._last_time = last + ahead, t_device_us
             return last + ahead, (Step.NEXT if ahead == 1 else Step.GAP), ahead - 1
-        behind = -ahead % WRAP
-        if behind == 0 or (behind < NEARBY and t_device_us <= self._last_time):
-            return last - behind, Step.REPEAT, 0
+        lag = -ahead % WRAP
+        if lag == 0 or (lag < NEARBY and t_device_us <= self._last_time):
+            return last - lag, Step.REPEAT, 0
         number = next_block(last, self._alignment) + seq % self._alignment
         self._offset = (number - seq) % WRAP
         self._last, self._last_time = number, t_device_us

@@ -59,10 +59,10 @@ class Table:
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """The values of a column, or of the index. Raises KeyError with the names that there are."""
-        for one in (self.index, *self.columns):
-            if one.name == name:
-                return one.values
-        names = [one.name for one in (self.index, *self.columns)]
+        for column in (self.index, *self.columns):
+            if column.name == name:
+                return column.values
+        names = [column.name for column in (self.index, *self.columns)]
         raise KeyError(f'no column {name!r}{did_you_mean(name, names)}; there are {", ".join(names)}')
 
     def to_pandas(self, *, clock: bool = False) -> pandas.DataFrame:

@@ -33,8 +33,8 @@ def sanitize(text: str, longest: int) -> str:
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``; did you mean X?`` if ``name`` is close to one of ``known``, else an empty string."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f'; did you mean {near[0]}?' if near else ''
+    matches = difflib.get_close_matches(name, list(known), n=1)
+    return f'; did you mean {matches[0]}?' if matches else ''
 
 
 NUMBER = re.compile(

@@ -99,20 +99,20 @@ def corner_finder(board: Any, dictionary: Any) -> Callable[[Any], tuple[Corners,
     if not _old():
         detector = aruco.CharucoDetector(board)
 
-        def found(grey: Any) -> tuple[Corners, Any, bool]:
+        def detect(grey: Any) -> tuple[Corners, Any, bool]:
             pixels, numbers, _, markers = detector.detectBoard(grey)
             return pixels, numbers, markers is not None and len(markers) > 0
 
-        return found
+        return detect
 
-    def found_by_46(grey: Any) -> tuple[Corners, Any, bool]:
+    def detect_by_46(grey: Any) -> tuple[Corners, Any, bool]:
         corners, markers, _ = aruco.detectMarkers(grey, dictionary)
         if markers is None:
             return None, None, False
         _, pixels, numbers = aruco.interpolateCornersCharuco(corners, markers, grey, board)
         return pixels, numbers, True
 
-    return found_by_46
+    return detect_by_46
 
 
 LEAST_CORNERS = 8
@@ -275,11 +275,11 @@ class Board(Target):
         scale = float(np.sqrt(np.mean(plane**2)))
         x, y = (plane / scale).T
         u, v = rays.T
-        one, nil = np.ones_like(x), np.zeros_like(x)
+        ones, zeros = np.ones_like(x), np.zeros_like(x)
         rows = np.concatenate(
             [
-                np.column_stack([x, y, one, nil, nil, nil, -u * x, -u * y, -u]),
-                np.column_stack([nil, nil, nil, x, y, one, -v * x, -v * y, -v]),
+                np.column_stack([x, y, ones, zeros, zeros, zeros, -u * x, -u * y, -u]),
+                np.column_stack([zeros, zeros, zeros, x, y, ones, -v * x, -v * y, -v]),
             ]
         )
         h = np.linalg.svd(rows)[2][-1].reshape(3, 3)

@@ -88,17 +88,17 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
             grey[: rows * factor, : columns * factor], (columns, rows), interpolation=opencv().INTER_AREA
         )
         try:
-            regions = _found([next(_binaries(small, smooth=False))], ratio, CLEAR / factor)
+            regions = _best_regions([next(_binaries(small, smooth=False))], ratio, CLEAR / factor)
         except NoPoseError as error:
             if error.status is Status.DOUBLED:
                 raise
         else:
             if min(r.axes[0] for r in regions) > _COARSE_RADIUS:
                 return [r.enlarged(factor) for r in regions]
-    return _found(_binaries(grey), ratio, CLEAR)
+    return _best_regions(_binaries(grey), ratio, CLEAR)
 
 
-def _found(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
+def _best_regions(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
     best: tuple[int, Status] = (0, Status.MISSING)
     for binary in binaries:
         if np.count_nonzero(binary[:, 1:] != binary[:, :-1]) > _MOST_EDGES:
@@ -333,8 +333,8 @@ class Discs(Target):
             self._plate, alternatives = best.rotation if self._plate is None else self._plate, []
         for other in alternatives:
             if (other.cost - best.cost) * best.residuals < ALIKE:
-                turn = best.rotation.T @ other.rotation
-                off = np.concatenate([(turn - turn.T)[(2, 0, 1), (1, 2, 0)] / 2, other.place - best.place])
+                relative = best.rotation.T @ other.rotation
+                off = np.concatenate([(relative - relative.T)[(2, 0, 1), (1, 2, 0)] / 2, other.place - best.place])
                 best = best._replace(covariance=best.covariance + np.outer(off, off))
         return best
 
@@ -358,8 +358,8 @@ class Discs(Target):
         right = rays * rotated_points[:, 2:] - rotated_points[:, :2]
         ray, at = rays.sum(axis=0) / len(rays), right.sum(axis=0) / len(rays)
         off = rays - ray
-        far = -float((off * (right - at)).sum() / (off * off).sum())
-        place = np.array([*(at + ray * far).tolist(), far])
+        depth = -float((off * (right - at)).sum() / (off * off).sum())
+        place = np.array([*(at + ray * depth).tolist(), depth])
         if place[2] <= 0.0:
             raise NoPoseError(Status.MISFIT)
         return np.asarray(place)

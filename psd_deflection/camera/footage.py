@@ -243,10 +243,10 @@ _ENCODINGS = {
 
 def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step: int, content: bytes) -> Any:
     """Return the grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
-    encoding_found = _ENCODINGS.get(encoding)
-    if encoding_found is None:
+    entry = _ENCODINGS.get(encoding)
+    if entry is None:
         return None
-    kind, channels, conversion = encoding_found
+    kind, channels, conversion = entry
     wide = width * channels * np.dtype(kind).itemsize
     if not (
         0 < wide <= step

@@ -135,29 +135,29 @@ def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     """Covariance (3, 3) of (dX, dY, theta) from those of both poses."""
     r = rest.rotation.T @ pose.rotation
     moved: FloatArray = rest.rotation.T @ (pose.place - rest.place)
-    onto, far = rest.rotation.T[:2], 1.0
+    onto, depth_ratio = rest.rotation.T[:2], 1.0
     size = 6 + rest.keystone.size
     of_rest, of_pose = np.zeros((3, size)), np.zeros((3, size))
     if pose.planar:
-        # The ray of ``pose`` meets the plane of the rest: rest.plane @ (x, y, 1) = far * pose.place.
+        # The ray of ``pose`` meets the plane of the rest: rest.plane @ (x, y, 1) = depth_ratio * pose.place.
         across = np.column_stack([rest.plane[:, :2], -pose.place])
-        *moved[:2], far = np.linalg.solve(across, -rest.place)
+        *moved[:2], depth_ratio = np.linalg.solve(across, -rest.place)
         moved[2], onto = 0.0, np.asarray(np.linalg.inv(across))[:2]
         of_rest[:2, 6:] = -np.outer(onto[:, 2], moved[: size - 6]) * rest.place[2]
-    of_pose[:2, 3:6], of_rest[:2, 3:6] = far * onto, -onto
+    of_pose[:2, 3:6], of_rest[:2, 3:6] = depth_ratio * onto, -onto
     # A small turn a of the rest's axes takes ``moved`` to moved - a x moved.
     of_rest[:2, :3] = onto @ rest.rotation @ _cross(moved)
     # theta = atan2(r10, r11); r goes to r (1 + [b]x), or to (1 - [a]x) r.
     scale = 1.0 / (r[1, 0] ** 2 + r[1, 1] ** 2)
-    by = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
-    of_pose[2, :3] = -_cross(r[1]) @ by
-    of_rest[2, :3] = [by @ r[2], 0.0, -by @ r[0]]
+    gradient = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
+    of_pose[2, :3] = -_cross(r[1]) @ gradient
+    of_rest[2, :3] = [gradient @ r[2], 0.0, -gradient @ r[0]]
     total = of_rest @ rest.covariance @ of_rest.T + of_pose @ pose.covariance @ of_pose.T
     if pose.planar:
         # A plate that left the plane of the rest moves in the image by that share of its distance from the middle.
         sd = math.sqrt(rest.covariance[5, 5] + pose.covariance[5, 5]) / float(pose.place[2])
         wide = float(np.linalg.norm(pose.place[:2])) + _MIDDLE * float(pose.place[2]) / AFFINE_FOCAL
-        total[:2, :2] += np.eye(2) * (max(abs(far - 1.0) - _STILL * sd, 0.0) * wide) ** 2
+        total[:2, :2] += np.eye(2) * (max(abs(depth_ratio - 1.0) - _STILL * sd, 0.0) * wide) ** 2
     return np.asarray((total + total.T) / 2)
 
 

@@ -44,8 +44,8 @@ def refined(image: Any, pixels: FloatArray, edges: FloatArray, reach: float, cro
     half = int(min(reach, MOST_REACH))
     offset = np.arange(-half, half + 1)
     dv, du = (a.ravel() for a in np.meshgrid(offset, offset, indexing='ij'))
-    near = np.hypot(du, dv) <= min(reach, MOST_REACH)
-    du, dv = du[near], dv[near]
+    in_reach = np.hypot(du, dv) <= min(reach, MOST_REACH)
+    du, dv = du[in_reach], dv[in_reach]
     base = np.rint(pixels).astype(int)
     rows, columns = image.shape
     inside = np.all((base >= half) & (base < [columns - half, rows - half]), axis=1)

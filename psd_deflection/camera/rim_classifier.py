@@ -103,12 +103,12 @@ class RimClassifier:
         relative = raw / float(contrast.mean())
         if motion > _DOUBLED_FROM * max(sharp, 0.5) and _doubled(normal, relative, shape.blur):
             raise NoPoseError(Status.GHOST)
-        misfit = _model_error(normal.z, relative, sector, rims, full_scale)
-        if misfit > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
+        model_error = _model_error(normal.z, relative, sector, rims, full_scale)
+        if model_error > MOST_MISFIT + MISFIT_OF_BLUR * min(max(motion / sharp - 0.5, 0.0), 1.5):
             raise NoPoseError(Status.MISFIT)
         # What the model does not say: a level that is off by the misfit moves the rim by that over the steepest rise.
         # It may be one disc's alone, and moves a rim more easily than it bends one.
-        wrong = 4.0 * misfit * ROOT_2PI * math.hypot(sharp, motion)
+        wrong = 4.0 * model_error * ROOT_2PI * math.hypot(sharp, motion)
         bent = inverse @ _of_bent_rims(normal, rims) / (pixel_radius * chi_square)
         bent[:, :6] *= math.hypot(CENTRE_FLOOR, wrong)
         bent[:, 6:] *= 0.5 * wrong
@@ -120,12 +120,12 @@ class RimClassifier:
         # Pixels of one line follow each other.
         begin = np.concatenate([[0], 1 + np.flatnonzero(line[1:] != line[:-1])])
         lines = line[begin]
-        for k, one in enumerate(pulls):
-            one *= weighted
+        for k, row in enumerate(pulls):
+            row *= weighted
             totals = (
-                np.bincount(sector, one),
-                np.bincount(column, one),
-                np.bincount(lines, np.add.reduceat(one, begin)),
+                np.bincount(sector, row),
+                np.bincount(column, row),
+                np.bincount(lines, np.add.reduceat(row, begin)),
             )
             squares[k] = max(float(total @ total) for total in totals)
         inverse = inverse[pose][:, pose]
@@ -146,7 +146,7 @@ class RimClassifier:
             shape.swell,
             noise,
             planar=not self._lens.known,
-            model_error=misfit,
+            model_error=model_error,
             keystone=shape.keystone,
         )
 

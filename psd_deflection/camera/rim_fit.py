@@ -89,10 +89,10 @@ class Fitter:
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
             if (np.abs(step) < _SETTLED * deviation).all():
                 break
-        found = self._classifier.pose(normal, rims, shape, step, prior, pixel_radius, full_scale)
+        pose = self._classifier.pose(normal, rims, shape, step, prior, pixel_radius, full_scale)
         if motion_of(shape.blur) < _SKEW_BLUR:
             self._blur = shape.blur
-        return found
+        return pose
 
     def _gather(self, image: Any, shape: Shape, half: float) -> tuple[Rims, FloatArray]:
         """Return the pixels nearer than ``half`` to a rim, and first lights by the means well in and out of it."""
@@ -121,15 +121,15 @@ class Fitter:
         away += (yy[:, None] * v * v).astype(np.float32)[:, :, None]
         squared = np.square([np.maximum(self._radius - bands, 0.0), self._radius + bands]).astype(np.float32)
         least, most = squared[:, :, None, None]
-        near = np.flatnonzero((away > least) & (away < most))
-        line = near // wide
-        along = near - wide * line
+        selected = np.flatnonzero((away > least) & (away < most))
+        line = selected // wide
+        along = selected - wide * line
         begin = np.searchsorted(line, np.arange(4) * tall)
         corner = starts[:, 0] + starts[:, 1] * self._columns
         chosen = (corner[:, None] + self._columns * np.arange(tall)).astype(int).ravel()[line]
         chosen += along
         level = image.ravel()[chosen].astype(np.float32)
-        rays, flat = np.empty((2, 3, len(near)), dtype=np.float32)
+        rays, flat = np.empty((2, 3, len(selected)), dtype=np.float32)
         rays[2] = flat[0] = 1.0
         np.take(self._rays[0], chosen, out=rays[0], mode='clip')
         np.take(self._rays[1], chosen, out=rays[1], mode='clip')
@@ -138,12 +138,12 @@ class Fitter:
         flat[1] += np.repeat((u[:, 0] * size).astype(np.float32), np.diff(begin))
         np.take((v.ravel() * size).astype(np.float32), line, out=flat[2], mode='clip')
         # The rise lies between: its pixels would make the contrast too small and the first step too long.
-        some, observed = away.ravel()[near[::THINNED]], level[::THINNED]
+        sampled, observed = away.ravel()[selected[::THINNED]], level[::THINNED]
         first = -(-begin // THINNED)
         light = np.zeros((3, LIGHTS))
         for k, (a, b, band) in enumerate(zip(first[:-1].tolist(), first[1:].tolist(), bands.tolist(), strict=True)):
-            inner = some[a:b] < max(self._radius - band / 2, self._radius / 2) ** 2
-            outer = some[a:b] > (self._radius + band / 2) ** 2
+            inner = sampled[a:b] < max(self._radius - band / 2, self._radius / 2) ** 2
+            outer = sampled[a:b] > (self._radius + band / 2) ** 2
             light[k, 0] = float(observed[a:b] @ outer) / max(int(np.count_nonzero(outer)), 1)
             light[k, 3] = float(observed[a:b] @ inner) / max(int(np.count_nonzero(inner)), 1)
         return Rims(begin, level, rays, flat, bends, chosen), light
@@ -156,9 +156,9 @@ class Fitter:
 
     def _slopes(self, plane: FloatArray, inverse: FloatArray, bends: FloatArray) -> FloatArray:
         """d plane point / d pixel (n, 2, 2) at the discs' centres; it changes little over a disc."""
-        far = self._points @ plane[2]
+        depth = self._points @ plane[2]
         forward = inverse[:2, :2] - self._centres[:, :, None] * inverse[2, :2]
-        return np.asarray((forward * far[:, None, None]) @ bends)
+        return np.asarray((forward * depth[:, None, None]) @ bends)
 
     def _converge(self, rims: Rims, shape: Shape, prior: PosePrior) -> tuple[Shape, tuple[float, float] | None]:
         """Return the shape by some of the pixels, and the noise outside and inside."""
@@ -267,9 +267,9 @@ class Fitter:
         np.matmul(inverse.T.astype(np.float32), inwards, out=parameters[3:6])
         ways = (inverse @ shape.rotation).T.astype(np.float32) @ inwards
         if shape.keystone.size:
-            far = parameters[5] * float(shape.place[2])
-            np.multiply(far, px, out=parameters[-2])
-            np.multiply(far, py, out=parameters[-1])
+            slope = parameters[5] * float(shape.place[2])
+            np.multiply(slope, px, out=parameters[-2])
+            np.multiply(slope, py, out=parameters[-1])
         np.multiply(py, ways[2], out=parameters[0])
         np.multiply(px, -ways[2], out=parameters[1])
         np.multiply(ways[1], px, out=parameters[2])

@@ -139,8 +139,8 @@ def after(normal: Normal, rims: Rims, step: FloatArray, ways: FloatArray) -> Pix
     onto[:, q, -1] = 1.0
     begin = rims.begin.tolist()
     out = np.empty((q + 1, begin[-1]), dtype=np.float32)
-    for a, b, one in zip(begin[:-1], begin[1:], onto.astype(np.float32), strict=True):
-        np.matmul(one, normal.rows[:, a:b], out=out[:, a:b])
+    for a, b, block in zip(begin[:-1], begin[1:], onto.astype(np.float32), strict=True):
+        np.matmul(block, normal.rows[:, a:b], out=out[:, a:b])
     return out
 
 

@@ -33,7 +33,7 @@ class Display:
         self._lock = threading.Lock()
         self._last = 0.0
         self._shown = False
-        self._counted = 0
+        self._last_count = 0
         self._recorded: dict[Path, Mapping[Path, str]] = {}
 
     def watch(self, session: Session) -> None:
@@ -83,11 +83,11 @@ class Display:
         if self._last and not self._live:
             # In a journal regular lines are noise; changes have their own messages.
             self._wait = min(2.0 * self._wait, PLAIN_REFRESH_LATER_S)
-        rate = (count - self._counted) / passed if self._last else math.nan
-        if count < self._counted:
+        rate = (count - self._last_count) / passed if self._last else math.nan
+        if count < self._last_count:
             # Another session, which counts from zero.
             rate = math.nan
-        self._last, self._counted = now, count
+        self._last, self._last_count = now, count
         text = line(rate)
         with self._lock:
             self._put(text + ('' if self._live else '\n'), shown=self._live)
@@ -115,7 +115,9 @@ def live_line(session: Session, rate: float) -> str:
     elif estimate is not None:
         pose = estimate.dx, estimate.dy, estimate.theta
         shown = zip(SYMBOLS, pose, estimate.variances, SHOWN, SHOWN_UNITS, strict=True)
-        body = '  '.join(f'{a} {v * by:+9.2f} ± {math.sqrt(var) * by:.2f} {unit}' for a, v, var, by, unit in shown)
+        body = '  '.join(
+            f'{a} {v * factor:+9.2f} ± {math.sqrt(var) * factor:.2f} {unit}' for a, v, var, factor, unit in shown
+        )
     else:
         body = f'no estimate: {spots.reason}' if spots is not None and spots.reason else 'no estimate yet'
     return f'{head}  {body}  {tail}'

@@ -153,21 +153,21 @@ def answer_each(
 def notify_each(
     args: argparse.Namespace,
     names: Sequence[str],
-    found: Mapping[str, Mapping[str, object]],
+    results: Mapping[str, Mapping[str, object]],
     failed: Mapping[str, str],
     head: Sequence[str],
     line: Callable[[Mapping[str, object]], Sequence[str]],
 ) -> None:
     """Print the table, or with --json one object a line. Raises SomeFailedError if some failed.
 
-    ``found``: what is printed of each as JSON; ``line``: the cells of its line under ``head``.
+    ``results``: what is printed of each as JSON; ``line``: the cells of its line under ``head``.
     """
     if args.json:
         for name in names:
-            print_json({'recording': name, 'error': failed.get(name), **found.get(name, {})})
+            print_json({'recording': name, 'error': failed.get(name), **results.get(name, {})})
     else:
         lines = [
-            (_short(name), *(line(found[name]) if name in found else ('failed', *[''] * (len(head) - 1))))
+            (_short(name), *(line(results[name]) if name in results else ('failed', *[''] * (len(head) - 1))))
             for name in names
         ]
         show_text(columns([('recording', *head), *lines], align_left=2))

@@ -231,17 +231,17 @@ def in_the_world(rig: Rig, words: Sequence[str]) -> Rig:
         return replace_values(rig, values, '--world')
 
 
-def recording_name(*others: str, to_look_at: bool = False) -> Callable[[str], str]:
-    """Reads the --out of a recording, whose ending may be one of ``others``; what it gives raises UsageError.
+def recording_name(*other_suffixes: str, to_look_at: bool = False) -> Callable[[str], str]:
+    """Reads the --out of a recording, whose ending may be one of ``other_suffixes``; what it gives raises UsageError.
 
     ``to_look_at``: whether it may be of a format that cannot be read back.
     """
 
     def read(text: str) -> str:
         suffix = Path(text).suffix.lower()
-        if suffix in FOREIGN and suffix not in others:
+        if suffix in FOREIGN and suffix not in other_suffixes:
             written = (f for f in formats() if f.write and (to_look_at or f.read))
-            endings = [*(ending for f in written for ending in f.suffixes), *others]
+            endings = [*(ending for f in written for ending in f.suffixes), *other_suffixes]
             if suffix in endings:
                 return text
             files = ', '.join(f'X{ending}' for ending in endings)
@@ -317,9 +317,9 @@ def require_ros(otherwise: str = '') -> None:
         raise ConfigError(
             f"rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`{otherwise}"
         )
-    left = shared_memory_left()
-    if left < NEEDED_BYTES:
+    free = shared_memory_left()
+    if free < NEEDED_BYTES:
         raise MachineError(
-            f'{SHARED_MEMORY} has {left} bytes left, ROS 2 needs {NEEDED_BYTES}: delete what nobody uses there, or '
+            f'{SHARED_MEMORY} has {free} bytes left, ROS 2 needs {NEEDED_BYTES}: delete what nobody uses there, or '
             f'make it larger (docker run --shm-size){otherwise}'
         )

@@ -143,13 +143,13 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         if not names:
             return super()._format_action(action)
         grouped = {name for group in GROUPS.values() for name in group}
-        others = {
+        other_groups = {
             'shell': [name for name in names if name in COMMANDS and name not in grouped],
             'plug-ins': [name for name in names if name not in COMMANDS],
         }
         wide = max(map(len, GROUPS)) + 4
         ours = {title: [name for name in group if name in COMMANDS] for title, group in GROUPS.items()}
-        lines = [(f'  {title}'.ljust(wide), group) for title, group in {**ours, **others}.items() if group]
+        lines = [(f'  {title}'.ljust(wide), group) for title, group in {**ours, **other_groups}.items() if group]
         return ''.join(
             textwrap.fill(', '.join(g), self._width, initial_indent=t, subsequent_indent=' ' * wide) + '\n'
             for t, g in lines
@@ -171,18 +171,18 @@ def plugged_in() -> dict[str, EntryPoint]:
     """The commands of other packages by their names; one that has the name of ours is left out."""
     from importlib.metadata import entry_points
 
-    found = (point for group in PLUG_INS for point in entry_points(group=group))
-    return {point.name: point for point in sorted(found, key=lambda p: p.name) if point.name not in COMMANDS}
+    points = (point for group in PLUG_INS for point in entry_points(group=group))
+    return {point.name: point for point in sorted(points, key=lambda p: p.name) if point.name not in COMMANDS}
 
 
 def make_parser(
     chosen: Collection[str],
     value: type[argparse.Action] | None = None,
-    others: Mapping[str, EntryPoint] = MappingProxyType({}),
+    plug_ins: Mapping[str, EntryPoint] = MappingProxyType({}),
 ) -> argparse.ArgumentParser:
     """The parser of all commands; only the ``chosen`` ones have arguments, so that other modules are not imported.
 
-    ``others``: see :func:`plugged_in`. Raises ConfigError if one that is chosen cannot be loaded.
+    ``plug_ins``: see :func:`plugged_in`. Raises ConfigError if one that is chosen cannot be loaded.
     """
     parser = argparse.ArgumentParser(
         prog='psd-deflection',
@@ -192,14 +192,14 @@ def make_parser(
     )
     parser.add_argument('--version', action='version', version=f'psd-deflection {__version__}')
     commands = parser.add_subparsers(title='commands', dest='command', metavar='COMMAND', required=True)
-    for name, summary in {**COMMANDS, **{name: f'of {point.value}' for name, point in others.items()}}.items():
+    for name, summary in {**COMMANDS, **{name: f'of {point.value}' for name, point in plug_ins.items()}}.items():
         sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
         # `-5,20` and `-2.9e1` are values, which argparse takes for options; it has no public way to be told.
         sub._negative_number_matcher = _NEGATIVE  # noqa: SLF001
         if value is not None:
             sub.register('action', None, value)
         if name in chosen:
-            module = _plug_in(others[name]) if name in others else module_of(name)
+            module = _plug_in(plug_ins[name]) if name in plug_ins else module_of(name)
             sub.description = module.__doc__
             module.add_arguments(sub)
             options = tuple(sub._option_string_actions)  # noqa: SLF001
@@ -217,14 +217,14 @@ def module_of(name: str) -> ModuleType:
 def _plug_in(point: EntryPoint) -> Any:
     """The command of another package. Raises ConfigError if it cannot be loaded or is none."""
     at = f'command {point.name!r}: {point.value}'
-    found: Any = loaded(f'{at} cannot be loaded', point.load)
-    if point.group == 'psd_deflection.studies' and callable(found):
+    command: Any = loaded(f'{at} cannot be loaded', point.load)
+    if point.group == 'psd_deflection.studies' and callable(command):
         from psd_deflection.cli.studies._answer import study_command
 
-        return study_command(found)
-    if not (callable(getattr(found, 'add_arguments', None)) and callable(getattr(found, 'run', None))):
+        return study_command(command)
+    if not (callable(getattr(command, 'add_arguments', None)) and callable(getattr(command, 'run', None))):
         raise ConfigError(f'{at}: has no add_arguments(parser) and run(args)')
-    return found
+    return command
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -292,14 +292,14 @@ def _discard_output() -> None:
 
 def _run(argv: list[str]) -> int:
     # `ros2 run` and `ros2 launch` add arguments for rclpy, which argparse must not see.
-    own, ros_arguments = _split_ros_arguments(argv)
+    arguments, ros_arguments = _split_ros_arguments(argv)
     chosen = [a for a in argv if a and not a.startswith('-')][:1]
     try:
-        parser = _parser_of(own, chosen)
+        parser = _parser_of(arguments, chosen)
         if not argv:
             parser.print_help()
             return 0
-        args, unknown = parser.parse_known_args(own)
+        args, unknown = parser.parse_known_args(arguments)
     except (UsageError, ConfigError) as error:
         _notify(f'{" ".join(["psd-deflection", *chosen])}: {error}')
         return error.exit_status
@@ -311,16 +311,16 @@ def _run(argv: list[str]) -> int:
     return _answer(args)
 
 
-def _parser_of(own: list[str], chosen: list[str]) -> argparse.ArgumentParser:
+def _parser_of(arguments: list[str], chosen: list[str]) -> argparse.ArgumentParser:
     """The parser that knows the command ``chosen``, which is none or one. Raises UsageError for an unknown command."""
-    _reject_empty(own)
+    _reject_empty(arguments)
     # Looked for only if they may be meant: it takes longer than a short command of ours.
-    others = {} if chosen and chosen[0] in COMMANDS else plugged_in()
-    names = {*COMMANDS, *others}
+    plug_ins = {} if chosen and chosen[0] in COMMANDS else plugged_in()
+    names = {*COMMANDS, *plug_ins}
     if chosen and chosen[0] not in names:
         hint = did_you_mean(chosen[0], names) or '; `psd-deflection --help` lists them'
         raise UsageError(f'no command {chosen.pop()!r}{hint}')
-    return make_parser(chosen, others=others)
+    return make_parser(chosen, plug_ins=plug_ins)
 
 
 def _answer(args: argparse.Namespace) -> int:
@@ -436,16 +436,16 @@ def _option_hint(unknown: Sequence[str], known: Collection[str]) -> str:
 
 
 def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    own: list[str] = []
+    arguments: list[str] = []
     for_ros: list[str] = []
     inside = False
     for argument in argv:
         if argument == '--ros-args':
             inside = True
-        (for_ros if inside else own).append(argument)
+        (for_ros if inside else arguments).append(argument)
         if argument == '--':
             inside = False
-    return own, for_ros
+    return arguments, for_ros
 
 
 def __getattr__(name: str) -> Callable[[], int]:

@@ -138,8 +138,8 @@ class ContractFrames(PortSource):
             decoder = self._decoder = FrameDecoder(self._psds)
             received = frames = 0
             deadline = time.monotonic() + timeout
-            while (left := deadline - time.monotonic()) > 0:
-                piece = port.read(left)
+            while (remaining := deadline - time.monotonic()) > 0:
+                piece = port.read(remaining)
                 received += len(piece)
                 hello: HelloFrame | None = None
                 for frame in decoder.feed(piece):
@@ -184,12 +184,12 @@ class ContractFrames(PortSource):
         try:
             return self._open(name, REOPEN_S)
         except DeviceError:
-            others = [c for c in candidate_ports(self._given, self._wanted) if c != name]
-            if not others:
+            candidates = [c for c in candidate_ports(self._given, self._wanted) if c != name]
+            if not candidates:
                 raise
-            self._next_candidate = (self._next_candidate + 1) % len(others)
+            self._next_candidate = (self._next_candidate + 1) % len(candidates)
             try:
-                return self._open(others[self._next_candidate], SCAN_S)
+                return self._open(candidates[self._next_candidate], SCAN_S)
             except DeviceError:
                 # Not our device: keep trying its previous port first.
                 self.name = name

@@ -172,8 +172,8 @@ class Dataq(PortSource):
         port.write(command(text))
         received = b''
         deadline = time.monotonic() + timeout
-        while (left := deadline - time.monotonic()) > 0:
-            received = (received + port.read(left))[-4096:]
+        while (remaining := deadline - time.monotonic()) > 0:
+            received = (received + port.read(remaining))[-4096:]
             reply = find_reply(received, text)
             if reply is not None:
                 return reply

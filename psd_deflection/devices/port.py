@@ -124,22 +124,22 @@ def waited_for(
 
     def run() -> None:
         try:
-            found = work()
+            result = work()
         except Exception as error:
             failed = error
             _settle(lambda: done.set_exception(failed))
             return
-        if not _settle(lambda: done.set_result(found)):
-            undo(found)
+        if not _settle(lambda: done.set_result(result)):
+            undo(result)
 
     try:
         threading.Thread(target=run, name='open port', daemon=True).start()
     except RuntimeError as error:
         raise DeviceError(f'{name}: cannot be opened ({error})') from None
     deadline = time.monotonic() + seconds
-    while (left := deadline - time.monotonic()) > 0 and not given_up.is_set():
+    while (remaining := deadline - time.monotonic()) > 0 and not given_up.is_set():
         try:
-            return done.result(min(left, SLICE_S))
+            return done.result(min(remaining, SLICE_S))
         except TimeoutError:
             if done.done():
                 return done.result()
@@ -201,8 +201,8 @@ def network_address(name: str, key: str = 'port', least: int = 1) -> Address | N
         return None
     scheme = url[1].lower()
     if scheme not in SCHEMES:
-        near = _OTHER_NAMES.get(scheme)
-        hint = f'; did you mean {near}://?' if near else did_you_mean(scheme, SCHEMES)
+        intended = _OTHER_NAMES.get(scheme)
+        hint = f'; did you mean {intended}://?' if intended else did_you_mean(scheme, SCHEMES)
         raise ConfigError(f'{key} = {shown(name)}: must be {FORMS}{hint}')
     place = _PLACE.fullmatch(url[2])
     form = f'{scheme}://HOST:PORT'

@@ -49,16 +49,16 @@ def find_device(name: str) -> Device:
     if not points:
         known = source_names()
         raise ConfigError(f'source = {name!r}: must be one of {", ".join(known)}{did_you_mean(name, known)}')
-    found: object = loaded(f'source = {name!r}: {points[0].value} cannot be loaded', points[0].load)
-    if isinstance(found, type) and issubclass(found, Source):
-        return Device(name, f'plug-in {points[0].value}', found)
-    if not isinstance(found, Device):
+    plug_in: object = loaded(f'source = {name!r}: {points[0].value} cannot be loaded', points[0].load)
+    if isinstance(plug_in, type) and issubclass(plug_in, Source):
+        return Device(name, f'plug-in {points[0].value}', plug_in)
+    if not isinstance(plug_in, Device):
         raise ConfigError(
-            f'source = {name!r}: {found!r} is neither a psd_deflection.devices.Device nor derived from Source there'
+            f'source = {name!r}: {plug_in!r} is neither a psd_deflection.devices.Device nor derived from Source there'
         )
-    if found.name != name:
-        raise ConfigError(f'source = {name!r}: {points[0].value} declares itself as {found.name!r}; name both alike')
-    return found
+    if plug_in.name != name:
+        raise ConfigError(f'source = {name!r}: {points[0].value} declares itself as {plug_in.name!r}; name both alike')
+    return plug_in
 
 
 def make_source(rig: Rig) -> Source:

@@ -123,14 +123,14 @@ def serve(device: LineDevice, port: HostSide, stopped: Callable[[], bool]) -> No
 
 def serve_all(devices: Sequence[LineDevice], ports: Sequence[HostSide], stopped: Callable[[], bool]) -> None:
     """Serve each device on its port until ``stopped()``, the first one in this thread."""
-    others = [
+    threads = [
         threading.Thread(target=serve, args=(device, port, stopped), name=port.name, daemon=True)
         for device, port in zip(devices[1:], ports[1:], strict=True)
     ]
-    for thread in others:
+    for thread in threads:
         thread.start()
     serve(devices[0], ports[0], stopped)
-    for thread in others:
+    for thread in threads:
         thread.join()
 
 
@@ -266,8 +266,8 @@ class ServedUdp:
 
     def listen(self, seconds: float) -> bytes | None:
         """What the host has sent, after at most ``seconds``; None if it takes no datagrams."""
-        if (left := self._absent_until - time.monotonic()) > 0.0:
-            time.sleep(min(seconds, left))
+        if (remaining := self._absent_until - time.monotonic()) > 0.0:
+            time.sleep(min(seconds, remaining))
             return None
         ready, _, _ = select.select((self._socket,), (), (), seconds)
         try:
@@ -305,9 +305,9 @@ def open_sockets(where: str, count: int) -> Iterator[list[Served]]:
     with contextlib.ExitStack() as stack:
         made: list[Served] = []
         for n in range(count):
-            one = replace(address, port=address.port + n if address.port else 0)
+            endpoint = replace(address, port=address.port + n if address.port else 0)
             try:
-                made.append(ServedTcp(one) if one.scheme == 'socket' else ServedUdp(one))
+                made.append(ServedTcp(endpoint) if endpoint.scheme == 'socket' else ServedUdp(endpoint))
             except (OSError, OverflowError) as error:
                 why = getattr(error, 'strerror', None) or error
                 raise ConfigError(f'serve = {where!r}: cannot be served there ({why})') from None

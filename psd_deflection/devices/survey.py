@@ -90,13 +90,13 @@ def stable_name(port: str) -> str:
 
 def serial_ports() -> list[Port]:
     """The machine's serial ports that have a device on them, as far as the system knows."""
-    found = []
+    ports = []
     for p in sorted(list_ports.comports(), key=lambda p: p.device):
         if p.hwid == 'n/a':
             # The built-in ports of a PC, mostly without a connector.
             continue
-        found.append(Port(p.device, p.description or ''))
-    return found
+        ports.append(Port(p.device, p.description or ''))
+    return ports
 
 
 def identify(port: Port, devices: Sequence[Device]) -> Port:
@@ -113,8 +113,8 @@ def identify(port: Port, devices: Sequence[Device]) -> Port:
         speeds = speeds[:1]
     try:
         for baud in speeds:
-            found = _ask(port, baud, probes)
-            if found.answered or found.promising or not found.bytes:
+            probing = _ask(port, baud, probes)
+            if probing.answered or probing.promising or not probing.bytes:
                 break
             # A device sends, but not at this speed.
     except DeviceError as error:
@@ -125,29 +125,29 @@ def identify(port: Port, devices: Sequence[Device]) -> Port:
 
 def _ask(port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> _ProtocolProbes:
     line = open_port(port.port, baud)
-    found = _ProtocolProbes(port, baud, probes)
+    probing = _ProtocolProbes(port, baud, probes)
     try:
         for _, probe in probes:
             if probe.question:
                 line.write(probe.question)
-                if _listen(line, found, ANSWER_S):
-                    return found
-        if _listen(line, found, ONCE_A_SECOND_S if found.bytes else BOOT_S):
-            return found
-        if found.promising:
+                if _listen(line, probing, ANSWER_S):
+                    return probing
+        if _listen(line, probing, ONCE_A_SECOND_S if probing.bytes else BOOT_S):
+            return probing
+        if probing.promising:
             port.answer = 'samples come, but the device does not say what it is'
-        elif found.bytes:
+        elif probing.bytes:
             speed = f' at {baud} baud' if has_baud(port.port) else ''
-            port.answer = f'{found.bytes} bytes that we cannot read{speed}'
+            port.answer = f'{probing.bytes} bytes that we cannot read{speed}'
     finally:
         line.close()
-    return found
+    return probing
 
 
-def _listen(line: OpenPort, found: _ProtocolProbes, seconds: float) -> bool:
+def _listen(line: OpenPort, probing: _ProtocolProbes, seconds: float) -> bool:
     deadline = time.monotonic() + seconds
-    while (left := deadline - time.monotonic()) > 0:
-        if found.feed(line.read(left)):
+    while (remaining := deadline - time.monotonic()) > 0:
+        if probing.feed(line.read(remaining)):
             return True
     return False
 
@@ -172,9 +172,9 @@ def suggestions(devices: Sequence[Device], ports: Sequence[Port]) -> list[dict[s
     for device in devices:
         if device.probe is None or device.probe.ports == 1:
             continue
-        found = [p.suggested for p in ports if p.source == device.name]
+        suggested = [p.suggested for p in ports if p.source == device.name]
         n = device.probe.ports
-        for first in range(0, len(found) - n + 1, n):
-            names = ','.join(s['port'] for s in found[first : first + n])
-            out.append({**found[first], 'port': names, **device.probe.together})
+        for first in range(0, len(suggested) - n + 1, n):
+            names = ','.join(s['port'] for s in suggested[first : first + n])
+            out.append({**suggested[first], 'port': names, **device.probe.together})
     return out

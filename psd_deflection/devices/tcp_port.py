@@ -64,12 +64,12 @@ class TcpPort(DescriptorPort):
 
     def write(self, frame: bytes) -> None:
         """Send to the device; PortClosedError if it is gone or takes nothing for a second."""
-        left = memoryview(frame)
+        unsent = memoryview(frame)
         deadline = time.monotonic() + WRITE_S
-        while left:
+        while unsent:
             self._check_given_up()
             try:
-                left = left[self._socket.send(left) :]
+                unsent = unsent[self._socket.send(unsent) :]
             except BlockingIOError:
                 if time.monotonic() > deadline:
                     raise PortClosedError(f'{self.name}: cannot be written to (it takes nothing)') from None

@@ -83,8 +83,8 @@ class TextLines(PortSource):
         try:
             decoder = LineDecoder()
             deadline = time.monotonic() + timeout
-            while (left := deadline - time.monotonic()) > 0:
-                piece = port.read(left)
+            while (remaining := deadline - time.monotonic()) > 0:
+                piece = port.read(remaining)
                 received += len(piece)
                 for item in decoder.feed(piece):
                     lines += isinstance(item, Line)
@@ -126,7 +126,7 @@ class TextLines(PortSource):
     def _hello(self, info: Mapping[str, object]) -> HelloFrame:
         """What the line that describes the device says."""
         psds = psds_of(info)
-        own: dict[str, object] = {
+        fields: dict[str, object] = {
             'serial': str(info.get('serial', ''))[:64],
             'firmware': 'text lines',
             'channels': list(channel_names(self._psds if psds == self._psds else 2)),
@@ -137,7 +137,7 @@ class TextLines(PortSource):
         if self._electrodes is None:
             # Otherwise what we hand on is volts.
             known.append('volts_per_count')
-        return HelloFrame(PROTOCOL_VERSION, own | {k: v for k, v in info.items() if k in known})
+        return HelloFrame(PROTOCOL_VERSION, fields | {k: v for k, v in info.items() if k in known})
 
     def _describe(self, info: Mapping[str, object]) -> None:
         """What the first description says of the readings; it holds as long as the port is open."""

@@ -124,8 +124,8 @@ class ThorlabsPair(Source):
         deadline = time.monotonic() + timeout
         received = 0
         port.write(INFO_REQUEST)
-        while (left := deadline - time.monotonic()) > 0:
-            piece = port.read(left)
+        while (remaining := deadline - time.monotonic()) > 0:
+            piece = port.read(remaining)
             received += len(piece)
             for message in decoder.feed(piece):
                 if isinstance(message, HardwareInfo):
@@ -152,23 +152,23 @@ class ThorlabsPair(Source):
             port.discard_input()
             decoder.reset()
             port.write(READINGS_REQUEST)
-        found: list[QuadrantReadings | None] = [None, None]
+        readings: list[QuadrantReadings | None] = [None, None]
         size = 0
         deadline = asked + round(ANSWER_S * 1e9)
-        while None in found and (left := deadline - time.monotonic_ns()) > 0:
-            waiting = [p for p, f in zip(self._ports, found, strict=True) if f is None]
-            _await(waiting, left * 1e-9)
+        while None in readings and (remaining := deadline - time.monotonic_ns()) > 0:
+            waiting = [p for p, f in zip(self._ports, readings, strict=True) if f is None]
+            _await(waiting, remaining * 1e-9)
             for number, port in enumerate(self._ports):
-                if found[number] is None:
+                if readings[number] is None:
                     piece = port.read(0.0)
                     size += len(piece)
-                    found[number] = _reading(self._decoders[number].feed(piece), events)
+                    readings[number] = _reading(self._decoders[number].feed(piece), events)
         now = time.monotonic_ns()
-        for decoder, reading in zip(self._decoders, found, strict=True):
+        for decoder, reading in zip(self._decoders, readings, strict=True):
             left_over = decoder.reset()
             if reading is None:
                 events.append(BadFrame('no answer in time', left_over))
-        return found[0], found[1], (asked + now) // 2, size
+        return readings[0], readings[1], (asked + now) // 2, size
 
     def start(self) -> None:
         """Begin the first slot now. After a reconnection the slots continue, so that the gap is detected."""
@@ -231,21 +231,21 @@ class ThorlabsPair(Source):
 
 def _await(ports: Sequence[OpenPort], seconds: float) -> None:
     """Wait for bytes on one of ``ports``; if one has no descriptor, only until it is to be asked again."""
-    found = [fd for port in ports if (fd := port.fileno()) is not None]
-    if len(found) == len(ports):
-        select.select(found, (), (), seconds)
+    descriptors = [fd for port in ports if (fd := port.fileno()) is not None]
+    if len(descriptors) == len(ports):
+        select.select(descriptors, (), (), seconds)
     else:
         time.sleep(min(seconds, POLL_S))
 
 
 def _reading(messages: list[AptMessage], events: list[Event]) -> QuadrantReadings | None:
-    found = None
+    latest = None
     for message in messages:
         if isinstance(message, QuadrantReadings):
-            found = message
+            latest = message
         elif isinstance(message, BadFrame):
             events.append(message)
-    return found
+    return latest
 
 
 def _floor(rate: float) -> str:

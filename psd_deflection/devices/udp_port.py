@@ -81,7 +81,7 @@ class UdpPort(OpenPort):
         # Before there is one: those that may be it, and what waits to be sent to it.
         self._candidates: dict[Any, _Candidate] = {}  # Bound: MOST_SENDERS.
         self._pending = b''
-        self._others = 0
+        self._other_datagrams = 0
         self._notices: list[Notice] = []  # Bound: one a port: that others send.
 
     def read(self, timeout: float) -> bytes:
@@ -133,17 +133,17 @@ class UdpPort(OpenPort):
 
     def _candidate(self, sender: Any) -> _Candidate:
         """What is known of somebody who may be the sender."""
-        found = self._candidates.get(sender)
-        if found is None:
+        candidate = self._candidates.get(sender)
+        if candidate is None:
             while len(self._candidates) >= MOST_SENDERS:
                 del self._candidates[next(iter(self._candidates))]
-            found = self._candidates[sender] = _Candidate(self._datagrams.validator())
-        return found
+            candidate = self._candidates[sender] = _Candidate(self._datagrams.validator())
+        return candidate
 
     def _other(self, datagram: bytes, sender: Any, now: float) -> None:
         """Count what somebody else sends. Raises PortClosedError if it is a device that follows a silent one."""
-        self._others += 1
-        if self._others == 1:
+        self._other_datagrams += 1
+        if self._other_datagrams == 1:
             self._notices.append(
                 Notice(f'datagrams of {_shown(sender)} are not taken: {_shown(self._sender)} sends already')
             )
@@ -172,8 +172,8 @@ class UdpPort(OpenPort):
 
     def notices(self) -> list[Notice]:
         """That others send, once."""
-        found, self._notices = self._notices, []
-        return found
+        notices, self._notices = self._notices, []
+        return notices
 
     def discard_input(self) -> None:
         """Discard datagrams that were not read: they are older than their time of reading."""
@@ -186,7 +186,7 @@ class UdpPort(OpenPort):
         sender = self._sender
         return {
             'sender': 'none yet' if sender is None else _shown(sender),
-            'datagrams of other senders': str(self._others),
+            'datagrams of other senders': str(self._other_datagrams),
         }
 
     def close(self) -> None:
@@ -208,8 +208,8 @@ class _Candidate:
 
 
 def _bound(address: Address) -> socket.socket:
-    found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
-    family, kind, protocol, _, place = found[0]
+    addresses = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
+    family, kind, protocol, _, place = addresses[0]
     made = socket.socket(family, kind, protocol)
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)

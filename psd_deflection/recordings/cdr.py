@@ -125,10 +125,10 @@ def _array_writer(write_one: _Writer, kind: str, length: str) -> _Writer:
 
 def _number_fields(message: MessageType) -> list[tuple[tuple[str, ...], int]] | None:
     """Access path of each float64, if a message consists of a header and float64 numbers; else None."""
-    (first, _), *others = message.members()
-    if first != 'std_msgs/Header' or not all(_only_numbers(message, kind) for kind, _ in others):
+    (first, _), *rest = message.members()
+    if first != 'std_msgs/Header' or not all(_only_numbers(message, kind) for kind, _ in rest):
         return None
-    return [part for kind, name in others for part in _numbers(message, kind, (name,))]
+    return [part for kind, name in rest for part in _numbers(message, kind, (name,))]
 
 
 def _only_numbers(message: MessageType, kind: str) -> bool:
@@ -208,10 +208,10 @@ def _reader(message: MessageType, kind: str) -> _Reader:
         raise KeyError(f'{message.name}: {kind} is not defined')
 
     def read_fields(body: bytes, at: int, order: str) -> tuple[Any, int]:
-        found = {}
+        values = {}
         for name, read in fields:
-            found[name], at = read(body, at, order)
-        return found, at
+            values[name], at = read(body, at, order)
+        return values, at
 
     return read_fields
 
@@ -262,11 +262,11 @@ def _array_reader(message: MessageType, kind: str, length: str) -> _Reader:
         if numbers is not None:
             values, at = numbers(body, at, order, count)
             return list(values), at
-        found = []
+        elements = []
         for _ in range(count):
-            one, at = read_one(body, at, order)  # type: ignore[misc]
-            found.append(one)
-        return found, at
+            element, at = read_one(body, at, order)  # type: ignore[misc]
+            elements.append(element)
+        return elements, at
 
     return read
 

@@ -64,7 +64,7 @@ def convert(
             recording.warn(f'{out}: a table has no place for marks: {len(marks)} left out')
         # A row takes what is waiting, and a block's last row what came during the block.
         records = itertools.chain(loads, references, temperatures, blocks)
-    kinds: list[type[Record]] = [type(found[0]) for found in beside if found]
+    kinds: list[type[Record]] = [type(rows[0]) for rows in beside if rows]
     sink = open_sink(out, parameters, device_hello=recording.hello, samples_with=kinds, psds=recording.psds)
     samples = 0
     with contextlib.closing(sink):

@@ -46,7 +46,7 @@ class RecordingInMemory(Recording):
     def topics(self) -> dict[str, int]:
         """Number of messages by topic, as in a bag of the same samples."""
         beside = ((LOAD, self.loads()), (REFERENCE, self.references()), (TEMPERATURE, self.temperatures()))
-        return {SAMPLES: sum(1 for _ in self.blocks()), **{topic: len(found) for topic, found in beside if found}}
+        return {SAMPLES: sum(1 for _ in self.blocks()), **{topic: len(rows) for topic, rows in beside if rows}}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
         """None: there are no messages."""

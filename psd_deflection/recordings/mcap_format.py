@@ -54,19 +54,19 @@ class Allowance:
     def __init__(self, size: int) -> None:
         self.size = size
         self.records = _RECORDS + size // _BYTES_A_RECORD
-        self._most = self._left = _UNPACKED_BYTES + _UNPACKED_EACH * size
+        self._most = self._remaining = _UNPACKED_BYTES + _UNPACKED_EACH * size
 
     def may_unpack(self, size: int) -> None:
         """Raise DamagedError if no chunk may declare ``size`` bytes, SpentError if the file may not unpack to more."""
         if size > MAX_CHUNK_BYTES:
             raise DamagedError(f'it declares {size} bytes, more than {MAX_CHUNK_BYTES}')
-        if size > self._left:
+        if size > self._remaining:
             most = f'{self._most} bytes, as many as a file of {self.size} bytes may'
             raise SpentError(f'unpacks to more than {most}: a chunk that declares {size} bytes is left out')
 
     def unpacked(self, size: int) -> None:
         """A chunk of ``size`` bytes was unpacked."""
-        self._left -= size
+        self._remaining -= size
 
     def outside(self) -> bool:
         """Allow for a record outside of any chunk; False if that is one too many."""
@@ -250,11 +250,11 @@ class _Fields:
     def texts(self) -> dict[str, str]:
         (size,) = self.numbers(_U32)
         end = self._at + size
-        found = {}
+        texts = {}
         while self._at < end:
             name = self.text()
-            found[name] = self.text()
-        return found
+            texts[name] = self.text()
+        return texts
 
 
 def parsed(opcode: int, content: bytes) -> McapRecord:

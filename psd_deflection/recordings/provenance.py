@@ -28,18 +28,18 @@ _OVERRIDES = ('OPENBLAS_CORETYPE', 'NPY_DISABLE_CPU_FEATURES', 'GLIBC_TUNABLES')
 @cache
 def provenance() -> Mapping[str, str]:
     """Name and value of each; of this process."""
-    found = {'psd_deflection': __version__, 'python': platform.python_version()}
+    entries = {'psd_deflection': __version__, 'python': platform.python_version()}
     for name in ('numpy', 'scipy'):
         try:
-            found[name] = version(name)
+            entries[name] = version(name)
         except PackageNotFoundError:
-            found[name] = 'unknown'
-    found['machine'] = platform.machine()
-    found['processor'] = _processor()
+            entries[name] = 'unknown'
+    entries['machine'] = platform.machine()
+    entries['processor'] = _processor()
     if chosen := ' '.join(f'{name}={os.environ[name]}' for name in _OVERRIDES if os.environ.get(name)):
-        found['kernel'] = chosen
-    found['C library'] = ' '.join(platform.libc_ver()).strip() or sys.platform
-    return MappingProxyType(found)
+        entries['kernel'] = chosen
+    entries['C library'] = ' '.join(platform.libc_ver()).strip() or sys.platform
+    return MappingProxyType(entries)
 
 
 def differences(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -91,7 +91,7 @@ class Recording(abc.ABC):
         self.memories: Sequence[ParameterChange] = ()
         self.restarts: set[tuple[int, int]] = set()
         self.requested_block_size = block_size
-        self._found = Warnings()
+        self._later_warnings = Warnings()
 
     @property
     def namespace(self) -> str:
@@ -187,7 +187,7 @@ class Recording(abc.ABC):
 
     def warn(self, text: str) -> None:
         """Add to ``warnings`` what was found while it was used."""
-        self._found.add(text)
+        self._later_warnings.add(text)
 
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size.
@@ -276,15 +276,15 @@ class Recording(abc.ABC):
         """Samples a second, from the sample numbers and times of the first thousand or so."""
         before: tuple[int, int] | None = None
         steps: list[tuple[int, int]] = []
-        counted = 0
+        n_samples = 0
         for block in self.blocks():
             for n, t_ns in ((int(block.seq[i]), int(block.t_ns[i])) for i in (0, -1)):
                 # Stamps 1 ns apart are those after a step of the time map: no rate.
                 if before is not None and t_ns - before[1] > SQUEEZED_NS * (n - before[0]) > 0:
                     steps.append((n - before[0], t_ns - before[1]))
-                    counted += n - before[0]
+                    n_samples += n - before[0]
                 before = n, t_ns
-            if counted >= 1000:
+            if n_samples >= 1000:
                 break
         if not steps:
             return 0.0
@@ -462,11 +462,11 @@ class RecordingWindow(Recording):
         """Whether a time lies in it, ns."""
         return self.first_ns <= t_ns < self.end_ns
 
-    def _held(self, found: Sequence[Held]) -> list[Held]:
+    def _held(self, values: Sequence[Held]) -> list[Held]:
         """Those in it, and the last one before it, from its start on."""
-        before = [one for one in found if one.t_ns <= self.first_ns]
-        return [one._replace(t_ns=self.first_ns) for one in before[-1:]] + [
-            one for one in found if self.first_ns < one.t_ns < self.end_ns
+        before = [value for value in values if value.t_ns <= self.first_ns]
+        return [value._replace(t_ns=self.first_ns) for value in before[-1:]] + [
+            value for value in values if self.first_ns < value.t_ns < self.end_ns
         ]
 
     def loads(self) -> list[AppliedLoad]:
@@ -487,19 +487,19 @@ class RecordingWindow(Recording):
 
     def marks(self) -> list[Mark]:
         """Those that were set in it."""
-        return [one for one in self._source.marks() if self.has(one.t_ns)]
+        return [mark for mark in self._source.marks() if self.has(mark.t_ns)]
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
         """Those that came in it."""
-        return ((t_ns, one) for t_ns, one in self._source.accelerations() if self.has(t_ns))
+        return ((t_ns, acceleration) for t_ns, acceleration in self._source.accelerations() if self.has(t_ns))
 
     def references(self) -> list[ReferencePose]:
         """Independent measurements of the tip."""
-        return [one for one in self._source.references() if self.has(one.t_ns)]
+        return [reference for reference in self._source.references() if self.has(reference.t_ns)]
 
     def references_with_covariance(self) -> list[ReferenceWithCovariance]:
         """The same with their covariances, if they were recorded."""
-        return [one for one in self._source.references_with_covariance() if self.has(one.t_ns)]
+        return [reference for reference in self._source.references_with_covariance() if self.has(reference.t_ns)]
 
     def temperatures(self) -> list[TemperatureReading]:
         """Ambient temperatures; the first is the last one before the start."""

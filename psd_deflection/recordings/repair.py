@@ -70,9 +70,9 @@ def _qos_of(metadata: Mapping[str, str]) -> Qos | list[Qos]:
     if not text or len(text) > _MAX_QOS_TEXT:
         return DEFAULT_QOS if not text else []
     with contextlib.suppress(YamlError):
-        found = parse_yaml(text)
-        if isinstance(found, list) and all(isinstance(q, dict) for q in found):
-            return found
+        profiles = parse_yaml(text)
+        if isinstance(profiles, list) and all(isinstance(q, dict) for q in profiles):
+            return profiles
     return []
 
 
@@ -150,9 +150,9 @@ class _Copy:
         self.abandon()
 
     def abandon(self) -> None:
-        for one in (self._stream, self._spool):
-            if one is not None:
-                one.close()
+        for file in (self._stream, self._spool):
+            if file is not None:
+                file.close()
 
 
 def _recover_file(path: Path) -> RecoveredFile:

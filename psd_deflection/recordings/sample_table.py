@@ -58,23 +58,23 @@ def samples_table(
     return Table(Column('t', samples['t'], 's', 'time from the first sample'), columns, {'path': path})
 
 
-def _held(found: Sequence[AppliedLoad] | Sequence[TemperatureReading], t_ns: IntArray) -> FloatArray:
-    """The values of ``found`` (n, number of values) at ``t_ns``, each held from its time; NaN before the first."""
-    times = np.array([f.t_ns for f in found], dtype=np.int64)
+def _held(records: Sequence[AppliedLoad] | Sequence[TemperatureReading], t_ns: IntArray) -> FloatArray:
+    """The values of ``records`` (n, number of values) at ``t_ns``, each held from its time; NaN before the first."""
+    times = np.array([f.t_ns for f in records], dtype=np.int64)
     order = np.argsort(times, kind='stable')
-    values = np.array([found[i][1:] for i in order], dtype=np.float64)
+    values = np.array([records[i][1:] for i in order], dtype=np.float64)
     index = np.searchsorted(times[order], t_ns, side='right') - 1
     out: FloatArray = values[np.maximum(index, 0)]
     out[index < 0] = np.nan
     return out
 
 
-def _once(found: Sequence[ReferencePose], t_ns: IntArray) -> FloatArray:
-    """The values of ``found`` (n, 3), each at the first of ``t_ns`` at or after its time; NaN in the others."""
+def _once(references: Sequence[ReferencePose], t_ns: IntArray) -> FloatArray:
+    """The values of ``references`` (n, 3), each at the first of ``t_ns`` at or after its time; NaN in the others."""
     out = np.full((len(t_ns), 3), np.nan)
-    index = np.searchsorted(t_ns, [f.t_ns for f in found], side='left')
+    index = np.searchsorted(t_ns, [f.t_ns for f in references], side='left')
     inside = index < len(t_ns)
-    out[index[inside]] = np.array([f[1:] for f in found], dtype=np.float64)[inside]
+    out[index[inside]] = np.array([f[1:] for f in references], dtype=np.float64)[inside]
     return out
 
 

@@ -51,15 +51,15 @@ def _mark_ns(recording: Marked, bound: str, after_ns: int | None) -> int:
         raise ConfigError(f'{bound!r}: must be s from the first sample, a time with a time zone, or {MARK_WORD}TEXT')
     text = bound.removeprefix(MARK_WORD).strip()
     there = recording.marks()
-    found = [mark.t_ns for mark in there if mark.text == text]
-    if not found:
+    times = [mark.t_ns for mark in there if mark.text == text]
+    if not times:
         names = sorted({mark.text for mark in there})
         have = f'its marks are {", ".join(names[:MOST_NAMED])}' if names else 'it has no marks'
         raise RecordingError(
             f'{recording.path}: has no mark {sanitize(text, LONGEST_TEXT)!r}; {have}{did_you_mean(text, names)}'
         )
     # To the mark that it begins with there is nothing: the next one is meant.
-    return next((t_ns for t_ns in found if after_ns is None or t_ns > after_ns), found[-1])
+    return next((t_ns for t_ns in times if after_ns is None or t_ns > after_ns), times[-1])
 
 
 def _ns(recording: Marked, bound: Bound, start_ns: int, after_ns: int | None = None) -> int:

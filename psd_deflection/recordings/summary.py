@@ -105,24 +105,24 @@ def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def _values_of(recording: Recording, name: str) -> list[tuple[ParameterChange, float]]:
     """The changes that note ``name``, a number."""
-    found = [(change, dict(change.values).get(name)) for change in recording.changes]
-    return [(change, float(value)) for change, value in found if isinstance(value, float | int)]
+    values = [(change, dict(change.values).get(name)) for change in recording.changes]
+    return [(change, float(value)) for change, value in values if isinstance(value, float | int)]
 
 
 def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
     """Missing parts that some command needs, each with the fix."""
-    found = []
+    missing = []
     if not topics.get(SAMPLES):
-        found.append(f'samples ({SAMPLES}): nothing can be computed from it')
+        missing.append(f'samples ({SAMPLES}): nothing can be computed from it')
     if not recording.parameters:
-        found.append(f'parameters: {THESIS_RIG}')
+        missing.append(f'parameters: {THESIS_RIG}')
     if recording.hello is None:
-        found.append('what the device says of itself')
+        missing.append('what the device says of itself')
     if not topics.get(DEFLECTION):
-        found.append(f'estimates ({DEFLECTION}): `psd-deflection replay` makes them')
+        missing.append(f'estimates ({DEFLECTION}): `psd-deflection replay` makes them')
     if not topics.get(LOAD):
-        found.append(f'known loads ({LOAD}): `psd-deflection discover` needs them')
-    return found
+        missing.append(f'known loads ({LOAD}): `psd-deflection discover` needs them')
+    return missing
 
 
 class _Counted:
@@ -167,8 +167,8 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
 
     ``topics``: from ``recording.topics()``; ``blocks_of_it``: its blocks, for a caller that counts them.
     """
-    counted = _Counted(recording, blocks_of_it if topics.get(SAMPLES) else ())
-    first, last, samples = counted.first, counted.last, counted.samples
+    counts = _Counted(recording, blocks_of_it if topics.get(SAMPLES) else ())
+    first, last, samples = counts.first, counts.last, counts.samples
     path = recording.path
     files = [f for f in path.iterdir() if f.is_file()] if path.is_dir() else [path]
     return {
@@ -187,10 +187,10 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'restarts': len(recording.restarts),
         'clock_steps': [{'t_ns': c.t_ns, 'step_s': s} for c, s in _values_of(recording, CLOCK_STEP)],
         'squeezed': sum(int(n) for _, n in _values_of(recording, CLOCK_SQUEEZED)),
-        'flagged': counted.flagged,
-        'sample_rate_hz': counted.rate_hz,
-        'vibration': counted.vibration.tree() if counted.vibration is not None else None,
-        'blocks': counted.blocks,
+        'flagged': counts.flagged,
+        'sample_rate_hz': counts.rate_hz,
+        'vibration': counts.vibration.tree() if counts.vibration is not None else None,
+        'blocks': counts.blocks,
         'block_size': recording.block_size,
         'topics': topics,
         'marks': [{'t_ns': m.t_ns, 't_s': (m.t_ns - first[1]) * 1e-9, 'text': m.text} for m in recording.marks()],

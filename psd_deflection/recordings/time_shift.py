@@ -83,10 +83,10 @@ def time_shift(
 
     if best in (0, 2 * most):
         return TimeShift(0.0, 0.0, unknown=AT_REST)
-    near = np.arange(max(best - 2, 0) * step, min(best + 2, 2 * most) * step + 1) - most * step
-    fine = np.concatenate([_shares(*_sums(*pair(k))) for k in near.tolist()])
-    at = min(max(int(np.argmin(np.log(fine).sum(axis=1))), step), len(near) - 1 - step)
-    values = _effective_values(*pair(int(near[at])), max(1, round(MEMORY_S / (period * step))))
+    shifts = np.arange(max(best - 2, 0) * step, min(best + 2, 2 * most) * step + 1) - most * step
+    fine = np.concatenate([_shares(*_sums(*pair(k))) for k in shifts.tolist()])
+    at = min(max(int(np.argmin(np.log(fine).sum(axis=1))), step), len(shifts) - 1 - step)
+    values = _effective_values(*pair(int(shifts[at])), max(1, round(MEMORY_S / (period * step))))
 
     def evidence(shares: FloatArray) -> FloatArray:
         ratio = shares / fine[at]
@@ -100,12 +100,12 @@ def time_shift(
     apart = np.count_nonzero(np.diff(possible.astype(np.int8)) == 1) > 1
     if possible[0] or possible[-1] or apart:
         return TimeShift(0.0, 0.0, unknown=REPEATS)
-    if outside and _better_elsewhere(a, b, int(near[at]), step, int(possible.sum())):
+    if outside and _better_elsewhere(a, b, int(shifts[at]), step, int(possible.sum())):
         return TimeShift(0.0, 0.0, unknown=REPEATS)
     # Squares of what is unshared, in units of their noise, are a parabola about the shift.
     before, here, after = fine[at - 1 : at + 2] / fine[at] @ values
     curvature = max(before - 2.0 * here + after, 1e-9)
-    shift = float(near[at]) + 0.5 * (before - after) / curvature
+    shift = float(shifts[at]) + 0.5 * (before - after) / curvature
     sd = float(np.hypot(np.sqrt(2.0 / curvature), INTERPOLATION * finer))
     expected = min(max(round(stated / period), -most * step), most * step)
     against = float(evidence(_shares(*_sums(*pair(expected))))[0])
@@ -163,8 +163,8 @@ def _sums_of_shifts(a: FloatArray, b: FloatArray, most: int) -> tuple[FloatArray
     p, q = a.shape[1], b.shape[1]
     ours, theirs = (np.fft.rfft(products(x), size, axis=0) for x in (a, b))
 
-    def over_shifts(left: npt.NDArray[np.complex128], right: npt.NDArray[np.complex128]) -> FloatArray:
-        sums = np.fft.irfft(np.conj(left) * right, size, axis=0)
+    def over_shifts(first: npt.NDArray[np.complex128], second: npt.NDArray[np.complex128]) -> FloatArray:
+        sums = np.fft.irfft(np.conj(first) * second, size, axis=0)
         return np.concatenate((sums[-most:], sums[: most + 1]))
 
     squares_a = over_shifts(ours[:, 1 + p :], theirs[:, :1]).reshape(-1, p, p)
@@ -180,9 +180,9 @@ def _better_elsewhere(a: FloatArray, b: FloatArray, shift: int, step: int, aroun
     counts, *sums = _sums_of_shifts(ours, theirs, len(ours) // 2)
     # All pairs together: in the half of a motion one pair may fit by chance, where the whole tells.
     shares, here = np.log(_shares(*sums)).sum(axis=1), shift // step + len(ours) // 2
-    others = counts > 0.4 * counts.max()
-    others[max(here - around, 0) : here + around + 1] = False
-    return bool((shares[others] < shares[here]).any())
+    elsewhere = counts > 0.4 * counts.max()
+    elsewhere[max(here - around, 0) : here + around + 1] = False
+    return bool((shares[elsewhere] < shares[here]).any())
 
 
 def _shares(squares_a: FloatArray, squares_b: FloatArray, crossed: FloatArray) -> FloatArray:

@@ -89,9 +89,9 @@ class LoggerTable(NamedTuple):
         """Dots (m, 2k), V, at times between two samples, only to compare them; NaN where no two are near."""
         dots = [i for i in range(self.volts.shape[1]) if i % 3 < 2]
         after = np.clip(np.searchsorted(self.t, grid), 1, len(self.t) - 1)
-        near = (self.t[after] - self.t[after - 1] < 2.0 * self.period) & (grid >= self.t[0]) & (grid <= self.t[-1])
+        valid = (self.t[after] - self.t[after - 1] < 2.0 * self.period) & (grid >= self.t[0]) & (grid <= self.t[-1])
         values = np.column_stack([np.interp(grid, self.t, self.volts[:, i]) for i in dots])
-        return np.where(near[:, None], values, np.nan)
+        return np.where(valid[:, None], values, np.nan)
 
 
 class JoinedTables(NamedTuple):
@@ -117,9 +117,9 @@ class JoinedTables(NamedTuple):
             rates = f'it gains {1e6 * o.rate:.1f} ± {1e6 * o.rate_sd:.1f} µs a second, which is put right'
         elif math.isfinite(o.rate_sd):
             rates = f'their rates agree within {SURE * 1e6 * o.rate_sd:.0f} µs a second'
-        found = 'as given' if o.given else f'± {o.sd:.5f} s at {o.at:.1f} s, by the motion; {rates}'
+        precision = 'as given' if o.given else f'± {o.sd:.5f} s at {o.at:.1f} s, by the motion; {rates}'
         return [
-            f'{self.second}: its clock shows {abs(o.seconds):.5f} s {way} than that of {self.first}, {found}',
+            f'{self.second}: its clock shows {abs(o.seconds):.5f} s {way} than that of {self.first}, {precision}',
             f'each sample is a reading of both, {1e3 * self.apart:.3f} ms apart (rms; {1e3 * self.most:.3f} ms at '
             f'most); {self.lost} are lost, without a reading of the other that is near',
         ]
@@ -128,8 +128,8 @@ class JoinedTables(NamedTuple):
         """The numbers, in s."""
         o = self.offset
         rate_sd = o.rate_sd if math.isfinite(o.rate_sd) else None
-        found = {'offset': o.seconds, 'offset_sd': o.sd, 'at': o.at, 'rate': o.rate, 'rate_sd': rate_sd}
-        return {**found, 'given': o.given, 'lost': self.lost, 'apart': self.apart, 'most': self.most}
+        fields = {'offset': o.seconds, 'offset_sd': o.sd, 'at': o.at, 'rate': o.rate, 'rate_sd': rate_sd}
+        return {**fields, 'given': o.given, 'lost': self.lost, 'apart': self.apart, 'most': self.most}
 
 
 def join(first: str | Path, second: str | Path, offset: float | None = None) -> JoinedTables:
@@ -170,14 +170,14 @@ def join(first: str | Path, second: str | Path, offset: float | None = None) -> 
     )
 
 
-def _pairs(t: FloatArray, others: FloatArray, within: float) -> tuple[IntArray, IntArray]:
-    """Which of ``t`` (n,) has which of ``others`` (m,): the nearest behind the last one taken, ``within`` s of it."""
-    after = np.clip(np.searchsorted(others, t), 1, len(others) - 1)
-    nearest = after - (t - others[after - 1] <= others[after] - t)
+def _pairs(t: FloatArray, other_t: FloatArray, within: float) -> tuple[IntArray, IntArray]:
+    """Which of ``t`` (n,) has which of ``other_t`` (m,): the nearest behind the last one taken, ``within`` s of it."""
+    after = np.clip(np.searchsorted(other_t, t), 1, len(other_t) - 1)
+    nearest = after - (t - other_t[after - 1] <= other_t[after] - t)
     last, taken = -1, []
     for i, (time, j) in enumerate(zip(t.tolist(), nearest.tolist(), strict=True)):
         j = max(j, last + 1)
-        if j < len(others) and abs(others[j] - time) <= within:
+        if j < len(other_t) and abs(other_t[j] - time) <= within:
             taken.append((i, j))
             last = j
     at, of = np.array(taken, np.int64).reshape(-1, 2).T
@@ -206,16 +206,16 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
     clock = ClockOffset(sure[0].seconds, sure[0].sd, 0.5 * (begin + end))
     edges = np.linspace(ours.t[0], ours.t[-1], min(MOST_PIECES, int(np.ptp(ours.t) / PIECE_S)) + 1)
     for _ in range(TURNS):
-        found = []
+        pieces = []
         for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             middle = 0.5 * (begin + end)
             piece = _shift(ours, theirs, begin, end, clock, NEAR_S + DRIFT * abs(middle - clock.at), outside=False)
             if not piece.unknown:
-                found.append((middle, piece.seconds, piece.sd))
-        if len(found) < 2:
+                pieces.append((middle, piece.seconds, piece.sd))
+        if len(pieces) < 2:
             break
         # The pushes in a piece are not in its middle: only what is left of a rate is found without a bias.
-        clock = _along(clock, *np.array(found).T)
+        clock = _along(clock, *np.array(pieces).T)
     return clock
 
 
@@ -235,13 +235,13 @@ def _shift(
     """
     grid = np.arange(begin, end, min(ours.period, theirs.period))
     first, second = ours.at(grid), theirs.at(clock.on_second(grid))
-    found = time_shift(first, second, float(grid[1] - grid[0]), reach, outside=outside)
-    if found.unknown or reach < NEAR_S:
-        return found
+    coarse = time_shift(first, second, float(grid[1] - grid[0]), reach, outside=outside)
+    if coarse.unknown or reach < NEAR_S:
+        return coarse
     # What is left is no part of a sample, which the interpolation would bias.
-    nearer = clock._replace(seconds=clock.seconds + found.seconds)
-    near = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S, outside=False)
-    return near if near.unknown else near._replace(seconds=found.seconds + near.seconds)
+    nearer = clock._replace(seconds=clock.seconds + coarse.seconds)
+    fine = _shift(ours, theirs, begin, end, nearer, 0.99 * NEAR_S, outside=False)
+    return fine if fine.unknown else fine._replace(seconds=coarse.seconds + fine.seconds)
 
 
 def _along(clock: ClockOffset, at: FloatArray, more: FloatArray, sd: FloatArray) -> ClockOffset:

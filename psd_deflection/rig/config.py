@@ -85,8 +85,8 @@ class Rig:
 
     def __repr__(self) -> str:
         changed = [p.with_value(self.values[p.name]) for p in self.parameters if self.values[p.name] != p.default]
-        own = sorted({key.partition('.')[0] for key in self.effects})
-        words = ', '.join([*changed, *(f'{EFFECTS_PREFIX}{name}' for name in own)])
+        keys = sorted({key.partition('.')[0] for key in self.effects})
+        words = ', '.join([*changed, *(f'{EFFECTS_PREFIX}{name}' for name in keys)])
         return f'<Rig {words}>' if words else '<Rig of the thesis>'
 
     def _repr_html_(self) -> str:
@@ -157,12 +157,12 @@ class Rig:
     @property
     def sensitivities(self) -> FloatArray:
         """Dot travel per volt on x and y, (number of PSDs, 2), m/V."""
-        return np.array([[own or self.amplifier.sensitivity for own in p.sensitivity] for p in self.psds])
+        return np.array([[given or self.amplifier.sensitivity for given in p.sensitivity] for p in self.psds])
 
     @property
     def noises(self) -> FloatArray:
         """Noise of x, y and sum, rms per sample, (number of PSDs, 3), V."""
-        return np.array([[own or self.amplifier.noise for own in (*p.noise, 0.0)] for p in self.psds])
+        return np.array([[given or self.amplifier.noise for given in (*p.noise, 0.0)] for p in self.psds])
 
 
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
@@ -216,14 +216,14 @@ def _more_psds(v: dict[str, Value], source: str) -> tuple[tuple[Section[PsdConfi
 
     Raises ConfigError if one has no centre, or the numbers have a gap.
     """
-    given = [next((p.name for p in own if p.name in v), '') for own in MORE_PARAMETERS]
+    given = [next((p.name for p in parameters if p.name in v), '') for parameters in MORE_PARAMETERS]
     count = max((i for i, name in enumerate(given, start=1) if name), default=0)
-    for i, own in enumerate(MORE_PARAMETERS[:count]):
+    for i, parameters in enumerate(MORE_PARAMETERS[:count]):
         name = MORE_PSDS[i][0].parameters['center'].name
         if name not in v:
             of = given[i] or given[count - 1]
             raise ConfigError(f'{source}: {of} is given without {name}: say where PSD {i + 3} is; PSDs have no gaps')
-        for p in own:
+        for p in parameters:
             v.setdefault(p.name, p.default)
     return MORE_PSDS[:count]
 

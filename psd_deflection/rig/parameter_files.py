@@ -67,12 +67,12 @@ def with_effects_section(text: str, effects: Mapping[str, Mapping[str, object]],
     sections = _sections_of('estimator')
 
     def edit(tree: Any) -> None:
-        found = [body['ros__parameters'] for name, body in tree.items() if name in sections]
-        for body in found:
+        bodies = [body['ros__parameters'] for name, body in tree.items() if name in sections]
+        for body in bodies:
             for key in [k for k in body if k == EFFECTS_PREFIX.rstrip('.') or str(k).startswith(EFFECTS_PREFIX)]:
                 del body[key]
         if effects:
-            found[-1][EFFECTS_PREFIX.rstrip('.')] = effects
+            bodies[-1][EFFECTS_PREFIX.rstrip('.')] = effects
 
     wanted = {k: v for k, v in flat_parameters(text, path).items() if not k.startswith(EFFECTS_PREFIX)}
     wanted.update(flattened({EFFECTS_PREFIX.rstrip('.'): effects}, str(path)))
@@ -117,8 +117,8 @@ def with_values(text: str, values: Mapping[str, object], source: str, path: Path
     if flat_parameters(out, path) != wanted:
         raise ConfigError(f'{path}: cannot be written again with the same values')
     older = '# ' + ' '.join(source.split()[:2]) + ' '
-    kept = ''.join(line for line in out.splitlines(keepends=True) if not line.startswith(older))
-    return f'# {sanitize(source, LONGEST_SOURCE)}\n{kept}'
+    retained = ''.join(line for line in out.splitlines(keepends=True) if not line.startswith(older))
+    return f'# {sanitize(source, LONGEST_SOURCE)}\n{retained}'
 
 
 def _readable(value: object) -> object:
@@ -143,16 +143,16 @@ def _in_a_line(value: object) -> object:
 
 def _places(body: Any, path: list[str]) -> list[tuple[Any, str]]:
     """Where the key is, as a map and its key: nested, dotted or in part."""
-    found = []
+    places = []
     for cut in range(1, len(path) + 1):
         key = '.'.join(path[:cut])
         if key not in body:
             continue
         if cut == len(path):
-            found.append((body, key))
+            places.append((body, key))
         elif isinstance(body[key], dict):
-            found += _places(body[key], path[cut:])
-    return found
+            places += _places(body[key], path[cut:])
+    return places
 
 
 def _new(body: Any, path: list[str]) -> tuple[Any, str]:

@@ -128,8 +128,8 @@ class Section(Generic[T]):
 
     def of(self, values: Mapping[str, Value]) -> T:
         """The section with these flat, checked values (``link.length``); lists become tuples."""
-        own = {name: values[p.name] for name, p in self.parameters.items()}
-        return self._kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in own.items()})
+        by_field = {name: values[p.name] for name, p in self.parameters.items()}
+        return self._kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in by_field.items()})
 
     def read(self, given: Mapping[str, object], source: str) -> T:
         """The section with what is ``given``, flat and unchecked, and its defaults.
@@ -151,8 +151,8 @@ class Section(Generic[T]):
 
     def values(self, settings: T) -> dict[str, Value]:
         """The flat values that :meth:`of` makes ``settings`` of."""
-        own = {p.name: getattr(settings, name) for name, p in self.parameters.items()}
-        return {name: list(v) if isinstance(v, tuple) else v for name, v in own.items()}
+        flat = {p.name: getattr(settings, name) for name, p in self.parameters.items()}
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in flat.items()}
 
 
 def _declared(prefix: str, field_name: str, kind: object, default: object, metadata: Mapping[str, Any]) -> Parameter:

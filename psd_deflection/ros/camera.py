@@ -165,17 +165,17 @@ def _image_fault(message: Any) -> str:
 def _info_fault(message: Any) -> str:
     if len(message.d) > MOST_DISTORTIONS:
         return f'{len(message.d)} numbers of distortion: must be at most {MOST_DISTORTIONS}'
-    beyond = [number for number in (*message.k, *message.d) if not abs(number) <= LARGEST_NUMBER]
-    return f'{beyond[0]:g}: must be finite and at most {LARGEST_NUMBER:g}' if beyond else ''
+    invalid = [number for number in (*message.k, *message.d) if not abs(number) <= LARGEST_NUMBER]
+    return f'{invalid[0]:g}: must be finite and at most {LARGEST_NUMBER:g}' if invalid else ''
 
 
 def run_camera(ros_arguments: Sequence[str], given: CameraSettings, log: LogCallback) -> int:
     """Measure until SIGINT or SIGTERM. Raises ConfigError."""
-    left = shared_memory_left()
-    if left < SHARED_BYTES:
-        log(f'{SHARED_MEMORY} has {left // 1000} kB left, of {SHARED_BYTES // 1000}: images come by UDP', WARNING)
+    free_bytes = shared_memory_left()
+    if free_bytes < SHARED_BYTES:
+        log(f'{SHARED_MEMORY} has {free_bytes // 1000} kB left, of {SHARED_BYTES // 1000}: images come by UDP', WARNING)
     with (
-        ros(NODE_NAME, ros_arguments, shared_memory=left >= SHARED_BYTES) as signals,
+        ros(NODE_NAME, ros_arguments, shared_memory=free_bytes >= SHARED_BYTES) as signals,
         contextlib.closing(CameraNode(given, log)) as owner,
     ):
         serve(owner, signals)

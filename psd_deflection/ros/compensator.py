@@ -187,10 +187,10 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         Raises DeviceError, and stays active, if they are not there after ``RELEASE_S``.
         """
         self._come_to_rest()
-        if self.command.sends and (left := self._remaining_offset()):
+        if self.command.sends and (offset := self._remaining_offset()):
             self._release_until = math.inf
             raise DeviceError(
-                f'{left} is left after {RELEASE_S:g} s ({self.command.text}, max_rate = {self.settings.max_rate:g}): '
+                f'{offset} is left after {RELEASE_S:g} s ({self.command.text}, max_rate = {self.settings.max_rate:g}): '
                 'it goes on; deactivate again'
             )
         super().deactivate()
@@ -222,17 +222,17 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._ended.set()
         self._sender.join()
         self._sender = None
-        if left := self._remaining_offset():
-            self.log(f'{left} is left with the controller: {self.command.text}', WARNING)
+        if offset := self._remaining_offset():
+            self.log(f'{offset} is left with the controller: {self.command.text}', WARNING)
 
     def _remaining_offset(self) -> str:
         """The largest offset that the controller may still have, in words; '' if it has none."""
         if not self._drive:
             return ''
         with self._lock:
-            left = self.command.offsets if self._failed is not None else self.compensator.remaining_offsets
-        worst = int(np.abs(left).argmax())
-        return f'an offset of {left[worst]:.3g} at {self._names[worst]}' if left[worst] else ''
+            offsets = self.command.offsets if self._failed is not None else self.compensator.remaining_offsets
+        worst = int(np.abs(offsets).argmax())
+        return f'an offset of {offsets[worst]:.3g} at {self._names[worst]}' if offsets[worst] else ''
 
     def at_rest(self) -> bool:
         """Let the offsets go back to zero; whether they are there, and the last ones have left."""
@@ -365,13 +365,13 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
 
     def _send_until_the_end(self) -> None:
         """Send the offsets every ``PERIOD_S``; a time that was missed is left out."""
-        due = time.monotonic()
+        next_time = time.monotonic()
         try:
-            while not self._ended.wait(max(due - time.monotonic(), 0.0)):
+            while not self._ended.wait(max(next_time - time.monotonic(), 0.0)):
                 if self._alone is not None:
                     raise self._alone
                 self._send()
-                due = max(due + PERIOD_S, time.monotonic())
+                next_time = max(next_time + PERIOD_S, time.monotonic())
         except BaseException as error:
             self._failed = error
             try:

@@ -150,9 +150,9 @@ def given_of(node: Node, section: Section[T], values: Mapping[str, Value]) -> T:
 
     Raises ConfigError for a value that is not valid.
     """
-    own = {p.name: p for p in section.parameters.values()}
-    given = {name: plain(p) for name, p in node.get_parameters_by_prefix('').items() if name in own}
-    return section.of({**values, **{name: check_value(own[name], value, SOURCE) for name, value in given.items()}})
+    known = {p.name: p for p in section.parameters.values()}
+    given = {name: plain(p) for name, p in node.get_parameters_by_prefix('').items() if name in known}
+    return section.of({**values, **{name: check_value(known[name], value, SOURCE) for name, value in given.items()}})
 
 
 def _is_ros_own(name: str) -> bool:

@@ -148,8 +148,8 @@ class Follower:
         components = (*goal.component_path_tolerance, *goal.component_goal_tolerance)
         if len(tolerances) + len(components) > LONGEST_LIST:
             return f'{len(tolerances) + len(components)} tolerances: must be at most {LONGEST_LIST}'
-        for one in (*tolerances, *components):
-            if not all(math.isfinite(getattr(one, name)) for name in COMPONENTS):
+        for tolerance in (*tolerances, *components):
+            if not all(math.isfinite(getattr(tolerance, name)) for name in COMPONENTS):
                 return 'a tolerance is not finite'
         # A negative leeway is one that is erased.
         return stamp_fault(stamp.sec, stamp.nanosec) or stamp_fault(abs(leeway.sec), leeway.nanosec)
@@ -272,21 +272,21 @@ class Follower:
         now = time.monotonic()
         silent = f'{self.action} has not answered within {ANSWER_S:g} s'
 
-        def due(since: float | None, after: float = ANSWER_S) -> bool:
+        def overdue(since: float | None, after: float = ANSWER_S) -> bool:
             return since is not None and now - since > after
 
         for goal in tuple(self._goals):
-            if goal is self._asked and due(goal.asked):
+            if goal is self._asked and overdue(goal.asked):
                 # Whether it follows this one or that before it, nobody knows.
                 self.stop(silent)
                 self._late(goal)
             elif goal.sent is None:
                 continue
-            elif due(goal.stopped) or due(goal.replaced):
+            elif overdue(goal.stopped) or overdue(goal.replaced):
                 self._give_up(goal, silent)
             elif not self.ready():
                 self._give_up(goal, f'{self.action} has gone')
-            elif due(goal.reported, SILENT_S):
+            elif overdue(goal.reported, SILENT_S):
                 self._give_up(goal, f'{self.action} has sent no feedback for {SILENT_S:g} s')
         self._pump()
 

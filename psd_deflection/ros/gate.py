@@ -79,16 +79,16 @@ class InputGate:
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
         ROS does not take.
         """
-        found: list[Subscription] = []
+        subscriptions: list[Subscription] = []
 
         def subscribe(row: GraphTopic) -> None:
-            found.append(self._subscribe(row, check, take, name or graph_name(row), type_name or row.type))
+            subscriptions.append(self._subscribe(row, check, take, name or graph_name(row), type_name or row.type))
 
         first, *latched = HEARD[topic]
         subscribe(first)
         for row in latched:
             self._latched[name or graph_name(row)] = functools.partial(subscribe, row)
-        return found
+        return subscriptions
 
     def serve(
         self,
@@ -180,8 +180,8 @@ class InputGate:
         DDS warns each publisher that keeps none of such a subscription, though another one gets its messages.
         """
         for topic, subscribe in tuple(self._latched.items()):
-            found = self._node.get_publishers_info_by_topic(topic)
-            if any(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for info in found):
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            if any(info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for info in publishers):
                 del self._latched[topic]
                 subscribe()
 
@@ -191,10 +191,10 @@ class InputGate:
 
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""
-        counted = sorted(self.rejected.items())
+        counts = sorted(self.rejected.items())
         return [
-            *((f'messages rejected: {topic}', str(count)) for topic, count in counted),
-            *((f'rejected last: {topic}', self.why[topic]) for topic, _ in counted),
+            *((f'messages rejected: {topic}', str(count)) for topic, count in counts),
+            *((f'rejected last: {topic}', self.why[topic]) for topic, _ in counts),
         ]
 
     def _let_in(self, size: int, most_bytes: int, rate: RateLimit, what: str = 'messages') -> str:

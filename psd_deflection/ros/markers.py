@@ -72,19 +72,19 @@ def moving(rig: Rig, estimate: DeflectionEstimate | None, spots: SpotMeans, magn
     def placed(x: float, y: float, z: float) -> Vector:
         return dx + c * x - s * y, dy + s * x + c * y, length + z
 
-    turn = Quaternion(**quaternion(theta))
+    orientation = Quaternion(**quaternion(theta))
     link = _marker(0, 'link', Marker.LINE_STRIP, _METAL, (2 * rig.link.outer_radius, 0.0, 0.0))
     places = np.linspace(0.0, 1.0, 21)
     for u, part in zip(places.tolist(), bend(places).tolist(), strict=True):
         link.points.append(Point(x=dx * part, y=dy * part, z=length * u))
     (middle, size), *sensors = tip_boxes(rig)
     plate = _marker(0, 'plate', Marker.CUBE, _PLATE, size, placed(*middle))
-    plate.pose.orientation = turn
+    plate.pose.orientation = orientation
     out = [link, plate]
     for i, psd in enumerate(rig.psds):
         (cx, cy), (zx, zy) = psd.center, psd.zero
         sensor = _marker(i + 1, 'psd', Marker.CUBE, _SENSOR, sensors[i][1], placed(*sensors[i][0]))
-        sensor.pose.orientation = turn
+        sensor.pose.orientation = orientation
         mx, my = spots.dots[2 * i], spots.dots[2 * i + 1]
         radius = 2.0 * psd.spot_radius
         where = placed(cx + zx + magnify * (mx - zx), cy + zy + magnify * (my - zy), psd.height - 0.002)

@@ -275,10 +275,10 @@ _IN = (
 
 
 def _by_name(rows: Iterable[GraphTopic]) -> dict[str, tuple[GraphTopic, ...]]:
-    found: dict[str, tuple[GraphTopic, ...]] = {}
+    rows_by_name: dict[str, tuple[GraphTopic, ...]] = {}
     for row in rows:
-        found[row.name] = (*found.get(row.name, ()), row)
-    return found
+        rows_by_name[row.name] = (*rows_by_name.get(row.name, ()), row)
+    return rows_by_name
 
 
 PUBLISHED: Mapping[str, GraphTopic] = {row.name: row for row in _OUT}

@@ -47,11 +47,11 @@ def follow(
     or a progress without needs. Raises RecordingError if the recording goes away, ConfigError for a rig that cannot
     be calibrated.
     """
-    size, due = -1, now()
+    size, next_time = -1, now()
     while True:
         running = recording()
         grown = _size(folder)
-        if running and (grown == size or now() < due):
+        if running and (grown == size or now() < next_time):
             pause(LOOK_S)
             continue
         size, began = grown, now()
@@ -59,7 +59,7 @@ def follow(
         yield step
         if step.ended or (step.progress is not None and not step.progress.needs):
             return
-        due = now() + max(LEAST_PAUSE_S, IDLE_SHARE * (now() - began))
+        next_time = now() + max(LEAST_PAUSE_S, IDLE_SHARE * (now() - began))
 
 
 def _step(folder: Path, asked: CalibrationOptions, *, ended: bool) -> BenchStep:

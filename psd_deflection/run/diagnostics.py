@@ -203,7 +203,7 @@ class HealthReporter:
             ('base accelerations, after their samples', str(motion.inertia.late)),
             ('base accelerations, not ended by another', str(motion.inertia.ended)),
             ('base accelerations, rejected', str(self._session.rejected[ACCELERATION])),
-            *zip(LOAD_WALK, (f'{walk:.3g}' for walk in motion.load_walk()), strict=True),
+            *zip(LOAD_WALK, (f'{random_walk:.3g}' for random_walk in motion.load_walk()), strict=True),
         ]
         level, message = OK, 'the modes predict the samples'
         worst = max(new.means())
@@ -313,10 +313,10 @@ def laser_entry(pipeline: Pipeline, psd: int, flows: bool = True) -> DiagnosticE
     # Reasons and findings name the detector they are about.
     names = (f'laser {psd} ', f'x{psd} ', f'y{psd} ', f'sum{psd} ', f'psd_{psd} ')
     fault = spots.reason if spots.reason.startswith(names) else ''
-    found = [f for f in spots.findings if f.startswith((f'psd_{psd}', 'one of the two lasers'))]
+    findings = [f for f in spots.findings if f.startswith((f'psd_{psd}', 'one of the two lasers'))]
     level, message = OK, 'dot seen'
-    if found:
-        level, message = WARN, '; '.join(found)
+    if findings:
+        level, message = WARN, '; '.join(findings)
     if fault or total < pipeline.rig.estimator.sum_min * 0.5:
         level, message = ERROR, fault or 'laser lost'
     values = (

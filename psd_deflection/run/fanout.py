@@ -22,8 +22,8 @@ from psd_deflection.rig.config import Rig
 
 def published(rig: Rig) -> dict[str, str]:
     """The topics of what a run of ``rig`` puts out, with their types."""
-    others = {*INPUTS, *spot_topics(MOST_PSDS)[len(rig.psds) :]}
-    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in others}
+    excluded = {*INPUTS, *spot_topics(MOST_PSDS)[len(rig.psds) :]}
+    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in excluded}
     if rig.estimator.filter == 'none':
         outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
     return outputs | {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}

@@ -40,7 +40,7 @@ class RecentDots:
         for index, _, values in rows:
             if first <= index <= last:
                 dots[index - first] = values
-        found = last_load_change(self._rig, dots, self._period)
+        step_s = last_load_change(self._rig, dots, self._period)
         # Times are those of the middles of blocks; a step lies between two.
-        ago_s = None if found is None else (last - first + 0.5) * self._period - found
+        ago_s = None if step_s is None else (last - first + 0.5) * self._period - step_s
         return None if ago_s is None else last_ns - round(ago_s * 1e9)

@@ -42,7 +42,7 @@ class RigPublisher:
         self._every = max(round(MEMORY_S * rig.converter.sample_rate_hz / rig.estimator.block_size), 1)
         # What holds before the first block is known now; which block that is, when it comes.
         self._first: ParameterChange | None = self._memory()
-        self._due: int | None = None
+        self._next_index: int | None = None
         self._untold: deque[tuple[Rig, ParameterChange]] = deque(maxlen=2)
         self._lock = threading.Lock()
 
@@ -58,12 +58,12 @@ class RigPublisher:
         if self._first is not None:
             first, self._first = self._first, None
             self._untold.append((pipeline.rig, first._replace(block=index)))
-        due = self._due if self._due is not None else index
-        if index < due:
+        next_index = self._next_index if self._next_index is not None else index
+        if index < next_index:
             return
         buffered = pipeline.buffers
-        if not buffered or (index >= due + LATE and buffered <= MOST_BUFFERED):
-            self._due = index + self._every
+        if not buffered or (index >= next_index + LATE and buffered <= MOST_BUFFERED):
+            self._next_index = index + self._every
             self._untold.append((pipeline.rig, self._memory()._replace(block=index + 1)))
 
     def put_change(self, change: ParameterChange) -> None:
@@ -84,7 +84,7 @@ class RigPublisher:
         with self._lock:
             if again or self._hello() != self._reported:
                 # A recorder that joins from now on waits for what comes next.
-                self._due = None
+                self._next_index = None
                 self._publish(self._environment)
 
     def _notify_memories(self) -> None:

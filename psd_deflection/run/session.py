@@ -468,8 +468,8 @@ class Session:
         folder = self.recorder.close()
         if self.recorder.failure and self._incomplete is None:
             self._incomplete = RecordingError(f'the recording ended early: {self.recorder.failure}')
-        if self.watcher is not None and (left := self.watcher.close(KEEP_S)):
-            self._report(f'watch: {left}', WARNING)
+        if self.watcher is not None and (unfinished := self.watcher.close(KEEP_S)):
+            self._report(f'watch: {unfinished}', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):
             self._report(f'{self._store.path}: not written within {KEEP_S:g} s; the zero may not be kept', WARNING)
         if self._simulated is not None:

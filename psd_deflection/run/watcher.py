@@ -160,11 +160,11 @@ class Watcher:
         """Write what is to be kept and hand on what waits, each within ``patience_s``; what is not done, or ''."""
         if self._due_ns is not None:
             self._keep()
-        left = [] if self._out.close(patience_s) else ['an alarm may not be handed on']
+        unfinished = [] if self._out.close(patience_s) else ['an alarm may not be handed on']
         if self._writing is not None:
             self._writing.join(patience_s)
-            left += ['what was to be kept may lack its end'] * self._writing.is_alive()
-        return f'not ended within {patience_s:g} s: {", ".join(left)}' if left else ''
+            unfinished += ['what was to be kept may lack its end'] * self._writing.is_alive()
+        return f'not ended within {patience_s:g} s: {", ".join(unfinished)}' if unfinished else ''
 
     def entry(self) -> DiagnosticEntry:
         """The state, for ``/diagnostics``."""
@@ -237,10 +237,10 @@ class Watcher:
         if self._parent is None:
             return
         most, most_bytes = self._config.watch_dir_max_recordings, self._config.watch_dir_max_bytes
-        kept = [(path, size) for path in sorted(self._parent.glob(f'{STEM}_*'), key=_made) if (size := _size_of(path))]
-        total = sum(size for _, size in kept)
-        for number, (path, size) in enumerate(kept[:-1]):
-            if len(kept) - number <= most and total <= most_bytes:
+        sizes = [(path, size) for path in sorted(self._parent.glob(f'{STEM}_*'), key=_made) if (size := _size_of(path))]
+        total = sum(size for _, size in sizes)
+        for number, (path, size) in enumerate(sizes[:-1]):
+            if len(sizes) - number <= most and total <= most_bytes:
                 break
             total -= size
             try:

@@ -42,17 +42,17 @@ class ZeroStore:
                 content = stream.read(MAX_BYTES + 1)
             if len(content) > MAX_BYTES:
                 raise ValueError(f'more than {MAX_BYTES} bytes')
-            kept: Any = json.loads(content)
-            if not isinstance(kept, dict) or not isinstance(kept.get('configured'), dict):
+            saved: Any = json.loads(content)
+            if not isinstance(saved, dict) or not isinstance(saved.get('configured'), dict):
                 raise ValueError('not what ~/zero writes')
-            zeros = {name: check_value(BY_NAME[name], kept.get(name), str(self.path)) for name in rig.zeros_by_name}
+            zeros = {name: check_value(BY_NAME[name], saved.get(name), str(self.path)) for name in rig.zeros_by_name}
         except FileNotFoundError:
             return rig, '', INFO
         except (OSError, ValueError, RecursionError, ConfigError) as error:
             return rig, f'{self.path}: the kept zero cannot be used ({error}); the rig file holds', WARNING
-        if kept.get('serial') != self._serial:
+        if saved.get('serial') != self._serial:
             return rig, f'{self.path}: the kept zero is that of another device; the rig file holds', WARNING
-        if kept['configured'] != self._configured:
+        if saved['configured'] != self._configured:
             return (
                 rig,
                 f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds',
@@ -63,10 +63,10 @@ class ZeroStore:
 
     def save(self, rig: Rig) -> str:
         """Save the zero of ``rig``; return '' or why it failed."""
-        kept = {'serial': self._serial, **rig.zeros_by_name, 'configured': self._configured}
+        content = {'serial': self._serial, **rig.zeros_by_name, 'configured': self._configured}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(self.path, json.dumps(kept, indent=1).encode())
+            replace_file(self.path, json.dumps(content, indent=1).encode())
         except OSError as error:
             return f'{self.path}: the zero cannot be kept ({error.strerror or error})'
         return ''

@@ -56,8 +56,7 @@ class SplitterRule(NamedTuple):
 
     def tree(self) -> dict[str, str | float | bool]:
         """For JSON."""
-        rule = {'words': self.words, 'value': self.value, 'limit': self.limit, 'unit': self.unit}
-        return {**rule, 'kept': self.satisfied}
+        return dict(zip(('words', 'value', 'limit', 'unit', 'kept'), self, strict=True))
 
 
 class LightPhase(NamedTuple):

@@ -13,7 +13,7 @@ from psd_deflection.arms.inputs import KNOWN_S, LONGEST_LIST, KnownJoints, joint
 def test_positions_are_known_for_a_while() -> None:
     known = KnownJoints()
     known.notify(1.0, ['a', 'b', 'c', 'd'], [0.1, math.nan, 1e300, -0.2])
-    assert {name: one.position for name, one in known.measured(1.0 + KNOWN_S).items()} == {'a': 0.1, 'd': -0.2}
+    assert {name: joint.position for name, joint in known.measured(1.0 + KNOWN_S).items()} == {'a': 0.1, 'd': -0.2}
     assert known.measured(1.01 + KNOWN_S) == {}
 
 

@@ -29,8 +29,8 @@ def ulps(got: FloatArray, want: FloatArray, least: float = 0.0) -> float:
 
 def test_every_operation_has_an_order_of_its_own() -> None:
     ours = {name for name in vars(Arithmetic) if not name.startswith('_')}
-    own = vars(FixedArithmetic) | vars(FixedFunctions)
-    assert {name for name in own if not name.startswith('_')} == ours
+    fixed = vars(FixedArithmetic) | vars(FixedFunctions)
+    assert {name for name in fixed if not name.startswith('_')} == ours
 
 
 def test_sine_and_cosine_are_within_two_ulps() -> None:
@@ -40,8 +40,8 @@ def test_sine_and_cosine_are_within_two_ulps() -> None:
     # Beyond, whole turns are taken off first: a search that diverges gets some number between -1 and 1.
     assert abs(FIXED.sin(1e12)) <= 1.0
     assert FIXED.sin_many(np.array([1e12]))[0] == FIXED.sin(1e12)
-    near = ANGLES[np.abs(ANGLES) < 1.5]
-    assert ulps(FIXED.tan_many(near), np.tan(near)) <= 4.0
+    inner = ANGLES[np.abs(ANGLES) < 1.5]
+    assert ulps(FIXED.tan_many(inner), np.tan(inner)) <= 4.0
 
 
 def test_arcs_are_right_to_two_units_in_the_last_place() -> None:
@@ -135,13 +135,13 @@ def test_sums_of_products_are_those_of_numpy(spec: tuple[str, *tuple[tuple[int, 
 def test_rows_are_added_in_pairs(count: int, shape: tuple[int, ...]) -> None:
     rows = np.random.default_rng(count).normal(size=(count, *shape))
 
-    def added(some: list[FloatArray]) -> FloatArray:
-        if len(some) < 2:
-            return some[0] if some else np.zeros(shape)
-        half = len(some) // 2
-        pairs = [some[i] + some[half + i] for i in range(half)]
-        if len(some) % 2:
-            pairs[0] = pairs[0] + some[-1]
+    def added(rows: list[FloatArray]) -> FloatArray:
+        if len(rows) < 2:
+            return rows[0] if rows else np.zeros(shape)
+        half = len(rows) // 2
+        pairs = [rows[i] + rows[half + i] for i in range(half)]
+        if len(rows) % 2:
+            pairs[0] = pairs[0] + rows[-1]
         return added(pairs)
 
     wanted = added(list(rows))
@@ -155,9 +155,9 @@ def test_rows_are_added_in_pairs(count: int, shape: tuple[int, ...]) -> None:
 
 def test_sums_in_threads_do_not_meet() -> None:
     rows = np.random.default_rng(0).normal(size=(8, 300, 20, 3))
-    wanted = [[in_pairs(block).tolist() for block in own] for own in rows]
+    wanted = [[in_pairs(block).tolist() for block in blocks] for blocks in rows]
     with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(lambda own: [in_pairs(block).tolist() for block in own], rows)) == wanted
+        assert list(pool.map(lambda blocks: [in_pairs(block).tolist() for block in blocks], rows)) == wanted
 
 
 @pytest.mark.parametrize('part', [1e-9, -1e-9, 1e-15, -1e-15, 0.0])
@@ -280,35 +280,35 @@ OF_MATH = {
 
 def processor_dependent(tree: ast.AST) -> list[tuple[int, str]]:
     """(line, words) of what rounds as the processor or a library chooses."""
-    found: list[tuple[int, str]] = []
+    uses: list[tuple[int, str]] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
-            found.append((node.lineno, 'a @ b'))
+            uses.append((node.lineno, 'a @ b'))
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             if node.value.id == 'np' and node.attr in MATRICES | FUNCTIONS | SUMS:
-                found.append((node.lineno, f'np.{node.attr}'))
+                uses.append((node.lineno, f'np.{node.attr}'))
             if node.value.id == 'math' and node.attr in OF_MATH:
-                found.append((node.lineno, f'math.{node.attr}'))
+                uses.append((node.lineno, f'math.{node.attr}'))
         if isinstance(node, ast.ImportFrom) and node.module == 'math':
-            found += [(node.lineno, f'math.{name.name}') for name in node.names if name.name in OF_MATH]
+            uses += [(node.lineno, f'math.{name.name}') for name in node.names if name.name in OF_MATH]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in SUMS - {'sum'}:
-            found.append((node.lineno, f'.{node.func.attr}()'))
+            uses.append((node.lineno, f'.{node.func.attr}()'))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ('sum', 'dot'):
             owner = node.func.value
             xp = isinstance(owner, ast.Name) and owner.id in ('xp', 'arithmetic')
             xp |= isinstance(owner, ast.Attribute) and owner.attr in ('_xp', 'xp')
             # Truths that are counted have no order.
-            counted = isinstance(owner, ast.Name) and owner.id == 'keep'
-            if not xp and not counted:
-                found.append((node.lineno, '.sum()'))
+            of_keep = isinstance(owner, ast.Name) and owner.id == 'keep'
+            if not xp and not of_keep:
+                uses.append((node.lineno, '.sum()'))
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and not isinstance(node.right, ast.Constant):
-            found.append((node.lineno, 'a ** b'))
+            uses.append((node.lineno, 'a ** b'))
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and isinstance(node.right, ast.Constant):
             constant = isinstance(node.left, ast.Constant)
             # numpy squares and takes roots of arrays without its power function.
             if node.right.value not in (2, 2.0) and not constant:
-                found.append((node.lineno, f'a ** {node.right.value!r}'))
-    return found
+                uses.append((node.lineno, f'a ** {node.right.value!r}'))
+    return uses
 
 
 def functions_of(path: Path) -> list[tuple[str, ast.AST]]:
@@ -330,10 +330,10 @@ def test_block_path_has_no_processor_dependent_code() -> None:
     for path in files:
         name = path.relative_to(PACKAGE).as_posix()
         for function, tree in functions_of(path):
-            found = processor_dependent(tree)
-            if found and (name, function) in NOT_OF_A_BLOCK:
+            uses = processor_dependent(tree)
+            if uses and (name, function) in NOT_OF_A_BLOCK:
                 used.add((name, function))
                 continue
-            wrong += [f'{name}:{line}: {what}, in {function or "the module"}' for line, what in found]
+            wrong += [f'{name}:{line}: {what}, in {function or "the module"}' for line, what in uses]
     assert wrong == []
     assert set(NOT_OF_A_BLOCK) == used

@@ -91,9 +91,9 @@ def test_updated_key_is_never_missing_for_a_thread() -> None:
 
     observed: list[bool] = []
     held: list[BoundedMap[str, int]] = []
-    kept: BoundedMap[str, int] = BoundedMap()
-    kept['a'] = 1
-    held.append(kept)
-    kept[Word('a')] = 2
+    words: BoundedMap[str, int] = BoundedMap()
+    words['a'] = 1
+    held.append(words)
+    words[Word('a')] = 2
     assert observed
     assert all(observed)

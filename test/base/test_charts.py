@@ -25,9 +25,9 @@ from tools.program import ROOT
 
 
 def reported(chart: Chart) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json">(.*?)</script>', drawn(chart))
-    assert found is not None
-    out: dict[str, Any] = json.loads(found[1])
+    match = re.search(r'<script type="application/json">(.*?)</script>', drawn(chart))
+    assert match is not None
+    out: dict[str, Any] = json.loads(match[1])
     return out
 
 
@@ -37,14 +37,14 @@ def column(content: dict[str, Any], place: int) -> FloatArray:
     return np.asarray(raw, np.float64)
 
 
-def one(x: FloatArray, *rows: FloatArray, words: str = 'words') -> Chart:
+def chart_of(x: FloatArray, *rows: FloatArray, words: str = 'words') -> Chart:
     curves = [Series(f'row {i}', x, row, 'blue') for i, row in enumerate(rows)]
     return Chart(words, [Panel(curves, 'time / s', 'x1 / µm')])
 
 
 def test_the_same_array_is_there_once() -> None:
     x = np.arange(5.0)
-    content = reported(Chart('words', [*one(x, x**2, x**3).panels, *one(x.copy(), x**2).panels]))
+    content = reported(Chart('words', [*chart_of(x, x**2, x**3).panels, *chart_of(x.copy(), x**2).panels]))
     assert len(content['columns']) == 3
     first, second = (panel['series'] for panel in content['panels'])
     assert [s['x'] for s in (*first, *second)] == [0, 0, 0]
@@ -68,7 +68,7 @@ def test_what_is_declared_reaches_the_page() -> None:
 
 def test_times_of_an_epoch_keep_their_digits() -> None:
     x = np.linspace(1.7e9, 1.7e9 + 0.06, 4)
-    content = reported(one(x, np.zeros(4)))
+    content = reported(chart_of(x, np.zeros(4)))
     assert content['columns'][0][0] == 'd'
     assert column(content, 0) == pytest.approx(x, abs=1e-6)
     assert content['columns'][1][0] == 'f'
@@ -80,12 +80,12 @@ def test_a_long_curve_keeps_its_extremes_and_its_gaps() -> None:
     y = np.random.default_rng(1).normal(size=n)
     y[51_234], y[73_210] = 100.0, -90.0
     y[20_000:20_300] = np.nan
-    content = reported(one(x, y, np.zeros(n)))
-    at, kept = (column(content, place) for place in (0, 1))
+    content = reported(chart_of(x, y, np.zeros(n)))
+    at, drawn_y = (column(content, place) for place in (0, 1))
     assert len(at) <= 4 * BUCKETS + 4
-    assert kept[np.argmin(np.abs(at - 51.234))] == 100.0
-    assert kept[np.argmin(np.abs(at - 73.210))] == -90.0
-    assert np.isnan(kept[np.argmin(np.abs(at - 20.0))])
+    assert drawn_y[np.argmin(np.abs(at - 51.234))] == 100.0
+    assert drawn_y[np.argmin(np.abs(at - 73.210))] == -90.0
+    assert np.isnan(drawn_y[np.argmin(np.abs(at - 20.0))])
     assert at[[0, -1]] == pytest.approx(x[[0, -1]])
     assert content['note'] == 'of every 100 points the least and the largest are drawn'
 
@@ -94,16 +94,16 @@ def test_a_cloud_keeps_points_that_do_not_lie_on_each_other() -> None:
     rng = np.random.default_rng(2)
     x = np.repeat([0.0, 10.0], 20_000)
     y = np.concatenate([rng.normal(size=20_000), np.full(20_000, 7.0)])
-    content = reported(one(x, y))
-    at, kept = (column(content, place) for place in (0, 1))
+    content = reported(chart_of(x, y))
+    at, drawn_y = (column(content, place) for place in (0, 1))
     assert 50 < len(at) < 300
     assert np.sum(at == 10.0) == 1
-    assert kept.max() == 7.0
+    assert drawn_y.max() == 7.0
     assert content['note'] == f'{len(at)} of 40000 points are drawn'
 
 
 def test_words_of_a_stranger_are_words() -> None:
-    text = drawn(one(np.arange(2.0), np.arange(2.0), words='</script><b>"'))
+    text = drawn(chart_of(np.arange(2.0), np.arange(2.0), words='</script><b>"'))
     assert text.count('</script>') == 1
     assert '<b>' not in text
     assert 'aria-label="&lt;/script&gt;&lt;b&gt;&quot;"' in text
@@ -116,7 +116,7 @@ def test_a_page_without_a_chart_runs_nothing() -> None:
 
 
 def test_page_policy_allows_only_its_own_scripts() -> None:
-    chart = drawn(one(np.arange(2.0), np.arange(2.0)))
+    chart = drawn(chart_of(np.arange(2.0), np.arange(2.0)))
     text = page('title', [chart, chart])
     scripts = re.findall(r'<script type="(?:text/javascript|module)">(.*?)</script>', text, flags=re.S)
     assert len(scripts) == 2

@@ -64,7 +64,7 @@ BOMBS = [merge_bomb(), alias_bomb(), '\n'.join(f'k{n}: {n}' for n in range(60_00
 
 def readers(path: Path) -> list[type[PsdDeflectionError]]:
     """Every reader of such a file rejects this one; with what."""
-    found: list[type[PsdDeflectionError]] = []
+    errors: list[type[PsdDeflectionError]] = []
     budget, discover = map(
         optional, ('psd_deflection.studies.budget.inputs', 'psd_deflection.studies.discover.from_recordings')
     )
@@ -75,8 +75,8 @@ def readers(path: Path) -> list[type[PsdDeflectionError]]:
             read(path)
         assert path.name in str(error.value)
         assert len(str(error.value)) < 500
-        found.append(error.type)
-    return found
+        errors.append(error.type)
+    return errors
 
 
 @pytest.mark.parametrize('text', TAGS)

@@ -27,9 +27,9 @@ KEYS = '[...document.querySelectorAll("button.key")]'
 
 @pytest.fixture(scope='module')
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    one = Page(tmp_path_factory.mktemp('profile'))
-    yield one
-    one.close()
+    page = Page(tmp_path_factory.mktemp('profile'))
+    yield page
+    page.close()
 
 
 @pytest.fixture
@@ -73,10 +73,10 @@ def move(page: Page, plot: str, across: float, up: float = 0.5) -> None:
 
 
 def values(page: Page) -> dict[str, str]:
-    found = page.js(
+    pairs = page.js(
         f'{KEYS}.map((k) => [k.dataset.plot + " " + k.dataset.name, k.querySelector("output").textContent])'
     )
-    return {name: value.replace('−', '-') for name, value in found}
+    return {name: value.replace('−', '-') for name, value in pairs}
 
 
 @pytest.mark.slow
@@ -139,13 +139,13 @@ def test_drag_zooms_plots_of_axis_and_button_resets(page: Page) -> None:
     move(page, 'c0p1', 0.2)
     ActionChains(page.driver).click_and_hold().move_by_offset(round(0.1 * over.size['width']), 0).release().perform()
     page.until(full)
-    found = []
+    times = []
     for across in (0.01, 0.99):
         move(page, 'c0p0', across)
         page.until('document.querySelector("output.at[data-plot=c0p0]").textContent !== ""')
-        found.append(float(page.js('document.querySelector("output.at[data-plot=c0p0]").textContent').split()[0]))
-    assert found[0] >= 19
-    assert found[1] <= 31
+        times.append(float(page.js('document.querySelector("output.at[data-plot=c0p0]").textContent').split()[0]))
+    assert times[0] >= 19
+    assert times[1] <= 31
     page.driver.find_element(By.CSS_SELECTOR, 'button.whole').click()
     page.until(f'!{full}')
     move(page, 'c0p0', 0.98)
@@ -155,14 +155,14 @@ def test_drag_zooms_plots_of_axis_and_button_resets(page: Page) -> None:
 @pytest.mark.slow
 def test_the_charts_are_accessible_and_no_wider_than_a_phone(page: Page) -> None:
     page.js('document.querySelector("details").setAttribute("open", "")')
-    found = []
+    problems = []
     for view in views(page.driver):
         page.driver.refresh()
         page.until('document.querySelectorAll(".uplot").length === 4')
-        found += [f'{view}: {line}' for line in violations(page.driver)]
+        problems += [f'{view}: {line}' for line in violations(page.driver)]
         assert page.js('document.documentElement.scrollWidth <= window.innerWidth')
         page.until(f'{DRAWN}("c0p0", "red") > 50', f'the colours of {view}')
-    assert found == []
+    assert problems == []
 
 
 @pytest.mark.slow

@@ -24,9 +24,9 @@ FOUND = sorted((ROOT / 'test' / 'data' / 'fuzz').glob('*'))
 
 @pytest.fixture
 def line(tmp_path: Path) -> Iterator[Line]:
-    one = Line(tmp_path)
-    yield one
-    one.close()
+    link = Line(tmp_path)
+    yield link
+    link.close()
 
 
 @pytest.fixture

@@ -63,9 +63,9 @@ def test_both_generators_show_two_effects_of_the_link_alike(first: str) -> None:
 @pytest.mark.parametrize('key', ['single-sensor_rotation-3-s', 'single-plane_tilt-3-s', 'single-quantisation-3-s'])
 def test_a_hidden_effect_is_named(key: str) -> None:
     case = next(c for c in short_cases() if c.key == key)
-    answer, found = run.answer(case, run.truth_of(case))
+    answer, discovery = run.answer(case, run.truth_of(case))
     assert [e['name'] for e in answer['effects']] == [case.wanted[0][0]]
-    assert found.simulations <= 2000
+    assert discovery.simulations <= 2000
 
 
 @pytest.mark.parametrize('noise', ['white', *NOISES])

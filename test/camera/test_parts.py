@@ -72,9 +72,9 @@ ROWS, COLUMNS = 6, 8
 @pytest.mark.parametrize('padding', [0, 5])
 def test_a_ros_image_is_grey_by_its_encoding(encoding: str, pixel: tuple[int, ...], grey: int, padding: int) -> None:
     row = bytes(pixel) * COLUMNS + bytes(padding)
-    found = of_ros_image(ROWS, COLUMNS, encoding, False, len(row), row * ROWS)
-    assert found.shape == (ROWS, COLUMNS)
-    assert np.abs(found.astype(int) - grey).max() <= 1
+    image = of_ros_image(ROWS, COLUMNS, encoding, False, len(row), row * ROWS)
+    assert image.shape == (ROWS, COLUMNS)
+    assert np.abs(image.astype(int) - grey).max() <= 1
     # A row less than it says, or rows that are too short.
     assert of_ros_image(ROWS, COLUMNS, encoding, False, len(row), row * (ROWS - 1)) is None
     assert of_ros_image(ROWS, COLUMNS + 6, encoding, False, len(row), row * ROWS) is None
@@ -94,9 +94,9 @@ def test_a_mosaic_has_its_colours_where_its_name_says(encoding: str, first: str,
     for row, letters in enumerate((first, second)):
         for column, letter in enumerate(letters):
             image[row::2, column::2] = 200 if letter == 'R' else 0
-    found = of_ros_image(ROWS, COLUMNS, encoding, False, COLUMNS, image.tobytes())
+    grey = of_ros_image(ROWS, COLUMNS, encoding, False, COLUMNS, image.tobytes())
     # A red that is the same everywhere: three tenths of it, in the middle.
-    assert np.abs(found[2:4, 2:6].astype(int) - 60).max() <= 2
+    assert np.abs(grey[2:4, 2:6].astype(int) - 60).max() <= 2
 
 
 def test_sixteen_bits_are_in_the_order_that_is_reported() -> None:
@@ -147,12 +147,12 @@ def test_a_fit_stays_within_its_bounds() -> None:
     shape = Shape(np.eye(3), np.array([0.0, 0.0, 1.0]), 1.0, np.eye(2), np.zeros(4), np.zeros((3, 6)), np.zeros(2))
     light, step = np.ones((3, 6)), np.zeros(16)
     step[3:7], step[7:10], step[10:] = (0.1, 0.2, 0.3, 0.9), (2000.0, 0.0, -5.0), (-2.0, -1.2, 1.2, 2.0, 0.3, 0.4)
-    found = moved(shape, step, light)
-    assert found.place == pytest.approx([0.1, 0.2, 1.3])
-    assert found.swell == 1.4
+    fitted = moved(shape, step, light)
+    assert fitted.place == pytest.approx([0.1, 0.2, 1.3])
+    assert fitted.swell == 1.4
     # A quarter of a pixel is as sharp as it gets, 30 pixels as wide.
-    assert found.blur == pytest.approx(np.diag([900.0, 0.0625]))
-    assert (found.skew.tolist(), found.keystone.tolist()) == ([-1.5, -1.2, 1.2, 1.5], [0.3, 0.4])
+    assert fitted.blur == pytest.approx(np.diag([900.0, 0.0625]))
+    assert (fitted.skew.tolist(), fitted.keystone.tolist()) == ([-1.5, -1.2, 1.2, 1.5], [0.3, 0.4])
     assert moved(shape, -0.01 * np.ones(16), light).blur == pytest.approx(np.eye(2) - 0.01)
     assert moved(shape, -step, light).swell == 0.7
 
@@ -188,13 +188,13 @@ def test_corners_of_the_model_are_found_exactly(crossing: bool, sharp: float, of
         a, b = (((u - x) * n[0] + (v - y) * n[1]) / s for n, s in zip((n1, n2), blur, strict=True))
         light = (2.0 * ndtr(a) - 1.0) * (2.0 * ndtr(b) - 1.0) if crossing else ndtr(a) * ndtr(b)
         image = np.where(np.abs(u - x) < 15.0, 120.0 + contrast * light, image)
-    found = refined(image, true + np.array([off, 0.0]), np.tile([first, second], (3, 1, 1)), 6.5, crossing)
-    assert np.isfinite(found.pixels).all(axis=1).tolist() == [there, there, False]
+    corners = refined(image, true + np.array([off, 0.0]), np.tile([first, second], (3, 1, 1)), 6.5, crossing)
+    assert np.isfinite(corners.pixels).all(axis=1).tolist() == [there, there, False]
     if not there:
         return
-    assert found.pixels[:2] == pytest.approx(true[:2], abs=1e-4)
-    assert found.blur[:2] == pytest.approx(np.tile(blur, (2, 1)), abs=1e-3)
-    assert found.rms[:2] == pytest.approx(0.0, abs=1e-4)
+    assert corners.pixels[:2] == pytest.approx(true[:2], abs=1e-4)
+    assert corners.blur[:2] == pytest.approx(np.tile(blur, (2, 1)), abs=1e-3)
+    assert corners.rms[:2] == pytest.approx(0.0, abs=1e-4)
 
 
 def discs_at(*places: tuple[float, float, float, float]) -> Any:
@@ -210,10 +210,10 @@ LINE = [(80.3, 60.1, 16.0, 20.0), (80.3, 110.1, 16.0, 20.0), (80.3, 160.1, 16.0,
 def test_drawn_discs_have_their_places_and_axes() -> None:
     for x in (80.3, 281.3):
         line = [(x, y, a, b) for _, y, a, b in LINE]
-        found = find_discs(discs_at(*line, (150.0, 20.0, 3.0, 3.0)), 2.5)
-        assert sorted(r.centre for r in found) == [pytest.approx(disc[:2], abs=0.1) for disc in line]
-        assert [r.axes for r in found] == [pytest.approx((16.0, 20.0), abs=0.2)] * 3
-        assert [r.shape for r in found] == [pytest.approx((256.0, 0.0, 400.0), abs=9.0)] * 3
+        discs = find_discs(discs_at(*line, (150.0, 20.0, 3.0, 3.0)), 2.5)
+        assert sorted(r.centre for r in discs) == [pytest.approx(disc[:2], abs=0.1) for disc in line]
+        assert [r.axes for r in discs] == [pytest.approx((16.0, 20.0), abs=0.2)] * 3
+        assert [r.shape for r in discs] == [pytest.approx((256.0, 0.0, 400.0), abs=9.0)] * 3
 
 
 @pytest.mark.parametrize(('apart', 'alike'), [(29.0, 1.0), (31.0, 0.0)])
@@ -223,15 +223,15 @@ def test_covariance_has_a_second_tilt_that_is_as_likely(
     """Half of the antisymmetric part of a turn is its sine about its axis; by 30 the log likelihoods are told apart."""
     best = target(np.array([0.2, -0.1, 0.0]), np.array([0.01, 0.02, 0.5]), np.zeros(0), 1)._replace(residuals=100)
     best = best._replace(points=np.array([[80.3, 60.1], [80.3, 110.1], [80.3, 160.1]]))
-    turn, shift = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 2e-3, -1e-3])
-    other = shifted(best, np.concatenate([turn, shift]))._replace(cost=apart / 100.0)
+    rotation, shift = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 2e-3, -1e-3])
+    other = shifted(best, np.concatenate([rotation, shift]))._replace(cost=apart / 100.0)
     fits = iter([other, best])
     monkeypatch.setattr(discs, 'Fitter', lambda *_: SimpleNamespace(fit=lambda *_: next(fits)))
     lens = Lens(np.array([[1000.0, 0.0, 150.0], [0.0, 1000.0, 100.0], [0.0, 0.0, 1.0]]), np.zeros(0))
     image = discs_at(*LINE)
-    found = target_of(CameraSettings(spacing=0.025, radius=0.01)).locate(image, image, lens, 255.0)
-    off = np.concatenate([np.sinc(np.linalg.norm(turn) / math.pi) * turn, shift])
-    np.testing.assert_allclose(found.covariance, best.covariance + alike * np.outer(off, off), rtol=1e-9)
+    located = target_of(CameraSettings(spacing=0.025, radius=0.01)).locate(image, image, lens, 255.0)
+    off = np.concatenate([np.sinc(np.linalg.norm(rotation) / math.pi) * rotation, shift])
+    np.testing.assert_allclose(located.covariance, best.covariance + alike * np.outer(off, off), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -341,20 +341,20 @@ def test_camera_rest_is_given_up_after_bounded_frames(rest_frames: int, last: in
     assert [a.status for a in answers] == [Status.OK] + [Status.HIDDEN] * last
 
 
-def target(turn: FloatArray, place: FloatArray, keystone: FloatArray, seed: int) -> TargetPose:
+def target(rotvec: FloatArray, place: FloatArray, keystone: FloatArray, seed: int) -> TargetPose:
     """A target with a covariance that ties all of its numbers, of about 1 mrad, 0.1 mm, 1e-3 /m."""
     sizes = np.array([*[1e-3] * 3, *[1e-4] * 3, *[1e-3] * len(keystone)])
     root = sizes[:, None] * np.random.default_rng(seed).normal(size=(len(sizes), 2 * len(sizes)))
-    rotation = Rotation.from_rotvec(turn).as_matrix()
+    rotation = Rotation.from_rotvec(rotvec).as_matrix()
     return TargetPose(
         rotation, place, root @ root.T, 0.0, 0, np.zeros((0, 2)), planar=keystone.size > 0, keystone=keystone
     )
 
 
-def shifted(pose: TargetPose, by: FloatArray) -> TargetPose:
+def shifted(pose: TargetPose, step: FloatArray) -> TargetPose:
     """The pose after a small turn about its own axes, a shift, and a change of its keystone."""
-    rotation = pose.rotation @ Rotation.from_rotvec(by[:3]).as_matrix()
-    return pose._replace(rotation=rotation, place=pose.place + by[3:6], keystone=pose.keystone + by[6:])
+    rotation = pose.rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+    return pose._replace(rotation=rotation, place=pose.place + step[3:6], keystone=pose.keystone + step[6:])
 
 
 @pytest.mark.parametrize('keystone', [[], [0.2, -0.1]], ids=['with a lens', 'without'])
@@ -366,15 +366,15 @@ def test_covariance_is_that_of_small_changes_of_rest_and_pose(keystone: list[flo
     pose = target(np.array([0.1, 0.4, 0.6]), rest.plane @ [0.004, 0.003, 1.0], 0.5 * perspective, 2)
 
     def changed(of: str, i: int, size: float) -> FloatArray:
-        by = np.zeros(6 + perspective.size)
-        by[i] = size
-        return relative(shifted(rest, by), pose)[:3] if of == 'rest' else relative(rest, shifted(pose, by))[:3]
+        step = np.zeros(6 + perspective.size)
+        step[i] = size
+        return relative(shifted(rest, step), pose)[:3] if of == 'rest' else relative(rest, shifted(pose, step))[:3]
 
     expected = np.zeros((3, 3))
-    for of, one in (('rest', rest), ('pose', pose)):
+    for of, target_pose in (('rest', rest), ('pose', pose)):
         slopes = [(changed(of, i, 1e-6) - changed(of, i, -1e-6)) / 2e-6 for i in range(6 + perspective.size)]
-        by = np.column_stack(slopes)
-        expected += by @ one.covariance @ by.T
+        jacobian = np.column_stack(slopes)
+        expected += jacobian @ target_pose.covariance @ jacobian.T
     sd = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         relative_covariance(rest, pose) / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-4
@@ -393,10 +393,10 @@ def test_mean_pose_has_frame_covariance_over_count() -> None:
 def test_turns_and_tilts_are_those_of_one_rotation_in_its_order() -> None:
     """Of a rest that is turned itself: R = Ry(omega) Rx(phi) Rz(theta), moved along the axes of the rest."""
     rest = target(np.array([0.2, -0.3, 0.4]), np.array([0.01, 0.02, 0.7]), np.zeros(0), 1)
-    own = Rotation.from_euler('YXZ', [0.05, -0.04, 0.3]).as_matrix()
+    relative_rotation = Rotation.from_euler('YXZ', [0.05, -0.04, 0.3]).as_matrix()
     place = rest.place + rest.rotation @ [1e-3, -2e-3, 3e-3]
-    found = relative(rest, rest._replace(rotation=rest.rotation @ own, place=place))
-    np.testing.assert_allclose(found, [1e-3, -2e-3, 0.3, -0.04, 0.05], atol=1e-12)
+    pose = relative(rest, rest._replace(rotation=rest.rotation @ relative_rotation, place=place))
+    np.testing.assert_allclose(pose, [1e-3, -2e-3, 0.3, -0.04, 0.05], atol=1e-12)
 
 
 def folder(path: Path, table: str) -> str:
@@ -559,9 +559,9 @@ def test_nothing_is_unpacked_of_an_image_that_is_too_large(name: str, monkeypatc
         imdecode = unpacked
 
     assert declared_size(LARGE[name]) == (32767, 32767)
-    found = decoded(LARGE[name], Cv2)
-    assert isinstance(found, NoPoseError)
-    assert str(found) == 'image too large (32767 x 32767 px)'
+    rejected = decoded(LARGE[name], Cv2)
+    assert isinstance(rejected, NoPoseError)
+    assert str(rejected) == 'image too large (32767 x 32767 px)'
 
 
 def test_opencv_has_the_same_bound_for_what_is_not_known_here() -> None:
@@ -589,9 +589,9 @@ def test_a_file_that_is_too_long_is_not_read_whole(tmp_path: Path, monkeypatch: 
     path = tmp_path / 'long.png'
     with path.open('wb') as stream:
         stream.truncate(MOST_BYTES)
-    found = read_image(path)
-    assert isinstance(found, NoPoseError)
-    assert found.status is Status.TOO_LARGE
+    rejected = read_image(path)
+    assert isinstance(rejected, NoPoseError)
+    assert rejected.status is Status.TOO_LARGE
 
 
 def test_an_image_of_another_size_says_both() -> None:

@@ -72,7 +72,7 @@ def test_a_target_describes_itself_by_its_own_settings(kind: str) -> None:
     target = target_of(settings_of(kind))
     assert target.kind == kind
     names = [line.split(':')[0] for line in target.describe()]
-    assert names == ['target.kind', *(SETTINGS.parameters[own].name for own in target.fields)]
+    assert names == ['target.kind', *(SETTINGS.parameters[name].name for name in target.fields)]
     assert all(name.startswith('target.') for name in names)
     # They make the same target again, and each of them is a setting that somebody has.
     values = dict(line.split(': ') for line in target.describe())
@@ -87,9 +87,9 @@ def _numbers(values: dict[str, str]) -> dict[str, object]:
 
 
 def test_every_size_in_the_settings_is_of_some_kind() -> None:
-    own = {f'{SETTINGS.parameters[name].name}' for kind in TARGETS for name in target_class(kind).fields}
+    declared = {f'{SETTINGS.parameters[name].name}' for kind in TARGETS for name in target_class(kind).fields}
     sizes = {p.name for p in SETTINGS.parameters.values() if p.name.startswith('target.')}
-    assert sizes - own == {'target.kind'}
+    assert sizes - declared == {'target.kind'}
     # Each of them may be set while the node runs.
     assert [p.name for p in SETTINGS.parameters.values() if not p.live] == ['frame_prefix']
 
@@ -135,19 +135,19 @@ def test_board_noise_is_pose_residual_over_freedom() -> None:
     assert isinstance(board, Board)
     image = shot(SMALL, BOARD, Pose(0.0, 0.0, 0.1, 0.02, -0.01), np.random.default_rng(3))
     matrix, distortion = np.array(SMALL.matrix).reshape(3, 3), np.array(BOARD.distortion)
-    found = board.locate(image, image, Lens(matrix, distortion), 255.0)
+    located = board.locate(image, image, Lens(matrix, distortion), 255.0)
     # All of the corners of 5 x 5 squares.
-    assert len(found.points) == 16
-    assert found.residuals == 32
+    assert len(located.points) == 16
+    assert located.residuals == 32
     apart = BOARD.square * (np.arange(4) - 1.5)
     corners = np.array([[x, y, 0.0] for x in apart for y in apart])
-    turn, _ = cv2.Rodrigues(found.rotation)
-    observed, _ = cv2.projectPoints(corners, turn, found.place, matrix, distortion)
-    away = np.linalg.norm(observed - found.points, axis=2)
+    rotvec, _ = cv2.Rodrigues(located.rotation)
+    observed, _ = cv2.projectPoints(corners, rotvec, located.place, matrix, distortion)
+    away = np.linalg.norm(observed - located.points, axis=2)
     # Each corner has its own, much nearer than the next.
     assert sorted(away.argmin(axis=0).tolist()) == list(range(16))
-    left = float(np.sum(away.min(axis=0) ** 2))
-    assert found.noise**2 == pytest.approx(left / (32 - 6), rel=0.005)
+    squares = float(np.sum(away.min(axis=0) ** 2))
+    assert located.noise**2 == pytest.approx(squares / (32 - 6), rel=0.005)
 
 
 @pytest.mark.parametrize(('settings', 'free'), [(replace(BOARD, marker=0.008), 1e-3), (TAGS, 1.4e-3)])
@@ -178,11 +178,11 @@ def test_the_lens_is_found_again() -> None:
     scene, rng = replace(SMALL, distance=0.16, distortion=(-0.15, 0.05)), np.random.default_rng(7)
     tilts = [(0.4, 0.0), (-0.4, 0.1), (0.0, 0.4), (0.1, -0.4), (0.3, 0.3), (-0.3, -0.3)]
     images = [(f'{i}.png', shot(scene, BOARD, Pose(phi=a, omega=b), rng)) for i, (a, b) in enumerate(tilts)]
-    found = calibrated(BOARD, [*images, ('broken.png', None)])
-    assert found.used == len(tilts)
-    assert found.excluded == [('broken.png', 'unreadable image')]
-    assert found.matrix[0, 0] == pytest.approx(scene.focal, rel=0.01)
-    lens = Lens(found.matrix, found.distortion)
+    fitted = calibrated(BOARD, [*images, ('broken.png', None)])
+    assert fitted.used == len(tilts)
+    assert fitted.excluded == [('broken.png', 'unreadable image')]
+    assert fitted.matrix[0, 0] == pytest.approx(scene.focal, rel=0.01)
+    lens = Lens(fitted.matrix, fitted.distortion)
     true = Lens(np.array(scene.matrix).reshape(3, 3), np.array([-0.15, 0.05, 0, 0]))
     corner = np.array([[60.0, 60.0], [340.0, 260.0]])
     assert np.diff(lens.rays(corner), axis=0) == pytest.approx(np.diff(true.rays(corner), axis=0), rel=0.01)
@@ -316,9 +316,9 @@ def test_reported_error_without_lens_has_its_true_size(tilt: tuple[float, float]
 
 def test_without_a_lens_the_distance_is_not_known_to_1_um() -> None:
     """Its picture away from the middle of the image moves as that of a displacement does."""
-    scene, near = Scene(aim=(0.01, 0.0)), Pose(z=0.04)
+    scene, closer = Scene(aim=(0.01, 0.0)), Pose(z=0.04)
     settings = CameraSettings(spacing=0.025, radius=0.008, rest_frames=2)
-    answer = measured(scene, [*STILL, near], settings)[-1]
+    answer = measured(scene, [*STILL, closer], settings)[-1]
     assert answer.covariance is not None
     assert 0.5e-3 < abs(answer.dx) < 3.0 * math.sqrt(answer.covariance[0, 0])
 

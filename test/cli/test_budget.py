@@ -78,10 +78,10 @@ def test_a_rigs_placement_is_compared(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_programs_get_the_same_placements_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['design', '--params-file', RIG, '--sigma', '2e-6', '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    own, _, best = found['placements']
-    assert own['centers'] == [[0.0, 0.07], [-0.1, 0.0]]
-    assert own['sd'] == pytest.approx({'dx': 1.630e-6, 'dy': 1.828e-6, 'theta': math.radians(1.328e-3)}, rel=1e-3)
+    tree = json.loads(capsys.readouterr().out)
+    current, _, best = tree['placements']
+    assert current['centers'] == [[0.0, 0.07], [-0.1, 0.0]]
+    assert current['sd'] == pytest.approx({'dx': 1.630e-6, 'dy': 1.828e-6, 'theta': math.radians(1.328e-3)}, rel=1e-3)
     assert best['sd'] == pytest.approx({'dx': 1.414e-6, 'dy': 1.414e-6, 'theta': math.radians(0.810e-3)}, rel=1e-3)
 
 

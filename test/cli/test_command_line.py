@@ -119,8 +119,8 @@ def examples(command: str, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> l
 @pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_its_examples_run(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:
-    found = examples(command, capsys, monkeypatch)
-    assert found
+    lines = examples(command, capsys, monkeypatch)
+    assert lines
     for link, target in (('bags', 'bags'), ('config', 'config'), ('my_rig.yaml', 'config/thesis_rig.yaml')):
         (tmp_path / link).symlink_to(ROOT / target)
     shutil.copytree(ROOT / 'bags' / 'clean', tmp_path / 'recordings' / 'psd_20260101_120000')
@@ -135,7 +135,7 @@ def test_its_examples_run(command: str, tmp_path: Path, monkeypatch: pytest.Monk
         words = ['--reference-noise', '1e-5,5e-4', '--effect', 'sensor_rotation,psd=2,angle=0.012']
         assert main(['simulate', '--out', 'moved.csv', '--loads', loads, *words]) == 0
         assert main(['calibrate', 'moved.csv', '--out', 'calibrated', '--quiet']) == 0
-    for line in found:
+    for line in lines:
         argv = shlex.split(line)[1:]
         args = make_parser([argv[0]]).parse_args(argv)
         assert args.command == command
@@ -171,10 +171,10 @@ def test_an_effect_is_explained_with_a_command_that_runs(name: str, tmp_path: Pa
 
 def test_programs_get_the_declaration(capsys: Capsys) -> None:
     assert main(['effects', 'sensor_rotation', '--json']) == 0
-    found = json.loads(capsys.readouterr().out)['sensor_rotation']
-    assert found['corrected'] == 'reading'
-    assert found['parameters']['angle']['unit'] == 'rad'
-    assert found['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
+    effect = json.loads(capsys.readouterr().out)['sensor_rotation']
+    assert effect['corrected'] == 'reading'
+    assert effect['parameters']['angle']['unit'] == 'rad'
+    assert effect['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_wrong_name_is_reported_with_the_right_one(capsys: Capsys) -> None:

@@ -76,8 +76,8 @@ def test_recordings_are_made_read_and_studied(way: tuple[str, str], tmp_path: Pa
         )
         assert done.returncode in ((0, 1) if '--compare' in step else (0,)), (step, done.stderr[-3000:])
     of_studies = {'discover': 'found/report.html', 'calibrate': 'calibrated/rig.yaml'}
-    found = (file for command, file in of_studies.items() if command in COMMANDS)
-    for name in ('bag', 'again.mcap', 'run.html', 'run.png', *found):
+    results = (file for command, file in of_studies.items() if command in COMMANDS)
+    for name in ('bag', 'again.mcap', 'run.html', 'run.png', *results):
         assert (tmp_path / name).exists(), name
 
 

@@ -33,14 +33,14 @@ def bag(tmp_path: Path) -> Path:
 
 def test_info_says_what_is_in_it(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['info', str(bag), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found['samples'], found['lost'], found['blocks'], found['flagged']) == (1182, 18, 60, 9)
-    assert found['duration_s'] == pytest.approx(1.199)
-    assert found['sample_rate_hz'] == pytest.approx(1000.0)
-    assert found['device_hello'] == HELLO
-    assert found['changed_parameters'] == {'sum_min': 1.5}
-    assert found['topics']['/psd/samples'] == 60
-    assert found['complete'] is True
+    tree = json.loads(capsys.readouterr().out)
+    assert (tree['samples'], tree['lost'], tree['blocks'], tree['flagged']) == (1182, 18, 60, 9)
+    assert tree['duration_s'] == pytest.approx(1.199)
+    assert tree['sample_rate_hz'] == pytest.approx(1000.0)
+    assert tree['device_hello'] == HELLO
+    assert tree['changed_parameters'] == {'sum_min': 1.5}
+    assert tree['topics']['/psd/samples'] == 60
+    assert tree['complete'] is True
     assert main(['info', str(bag)]) == 0
     text = capsys.readouterr().out
     for part in ('complete', '18 lost', 'serial A1', 'sum_min = 1.5', '/link_tip/wls/deflection', '2025-10-09'):
@@ -102,10 +102,10 @@ def test_times_of_marks_and_changes_count_from_the_start(
 ) -> None:
     def part(*given: Any) -> dict[str, Any]:
         """As of a part that begins within the block of its mark."""
-        found = summary(*given)
-        moved = {'t_ns': found['start_ns'] + 40_000_000, 'block': 200, 'values': {'state.a': 1.0}}
-        before = {'t_ns': found['start_ns'] - 1, 'block': 190, 'values': {'psd_1.noise': 0.1}}
-        return {**found, 'marks': [{'t_s': -1e-5, 'text': 'on'}], 'changes': [before, moved]}
+        tree = summary(*given)
+        moved = {'t_ns': tree['start_ns'] + 40_000_000, 'block': 200, 'values': {'state.a': 1.0}}
+        before = {'t_ns': tree['start_ns'] - 1, 'block': 190, 'values': {'psd_1.noise': 0.1}}
+        return {**tree, 'marks': [{'t_s': -1e-5, 'text': 'on'}], 'changes': [before, moved]}
 
     monkeypatch.setattr('psd_deflection.cli.recordings.info.summary', part)
     assert main(['info', str(bag)]) == 0
@@ -125,10 +125,10 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
             late = np.clip(1_000_000 - integer.seq * 1000, 0, None)
             bag.put(SampleBlock(i, integer.seq, integer.t_ns - late, integer.volts, integer.flags))
     assert main(['info', str(tmp_path / 'run'), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
+    tree = json.loads(capsys.readouterr().out)
     assert open_recording(tmp_path / 'run').sample_rate_hz == pytest.approx(999.0, rel=1e-4)
-    assert found['sample_rate_hz'] == pytest.approx(1000.0, rel=3e-4)
-    assert found['lost'] == 0
+    assert tree['sample_rate_hz'] == pytest.approx(1000.0, rel=3e-4)
+    assert tree['lost'] == 0
 
 
 def test_only_recorded_parameters_are_reported_as_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -170,9 +170,9 @@ BAGS = Path(__file__).parent.parent.parent / 'bags'
 
 def content_of(page: Path) -> dict[str, Any]:
     """The data in an interactive page."""
-    found = re.search(r'<script type="application/json" id="recording">(.*?)</script>', page.read_text(), re.S)
-    assert found is not None
-    content: dict[str, Any] = json.loads(found[1])
+    match = re.search(r'<script type="application/json" id="recording">(.*?)</script>', page.read_text(), re.S)
+    assert match is not None
+    content: dict[str, Any] = json.loads(match[1])
     return content
 
 

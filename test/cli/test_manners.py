@@ -452,16 +452,16 @@ def test_json_is_all_that_is_on_stdout(
     # A recording of another machine may differ in its last bits.
     assert main([*argv, '--json']) in ((0, 1) if '--compare' in argv else (0,))
     out, err = capsys.readouterr()
-    found = strict(out)
-    assert isinstance(found, dict)
+    tree = strict(out)
+    assert isinstance(tree, dict)
     if '--compare' in argv:
-        compared = found['compared']
+        compared = tree['compared']
         assert compared['equal'] + compared['different'] > 1000
         assert compared['same'] == (not compared['different'])
     elif argv[0] == 'replay':
-        assert found['compared'] is None
+        assert tree['compared'] is None
     elif argv[0] == 'recover':
-        (recording,) = found['recordings']
+        (recording,) = tree['recordings']
         (file,) = recording['files']
         assert file['repaired']
         assert file['messages'] > 500
@@ -539,8 +539,8 @@ def test_how_long_a_recording_lasts_is_by_its_stamps(command: str, tmp_path: Pat
     path.write_text(f't,x1,y1,sum1,x2,y2,sum2\n{rows}\n')
     out = ['--out', str(tmp_path / 'run.png')] if command == 'plot' else []
     assert main([command, str(path), '--json', *out]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found['seconds' if command == 'replay' else 'duration_s'] == pytest.approx(2.0)
+    tree = json.loads(capsys.readouterr().out)
+    assert tree['seconds' if command == 'replay' else 'duration_s'] == pytest.approx(2.0)
 
 
 ESCAPE = '\x1b[31mred\x1b]0;title\x07\nstate complete'

@@ -72,9 +72,9 @@ def test_the_estimates_of_all_are_one_table(archive: Path, capsys: pytest.Captur
     assert counts.to_dict() == {str(archive / 'archive' / 'one.mcap'): 20, str(archive / 'archive' / 'two.mcap'): 10}
     assert main(['replay', 'archive/one.mcap', '--out', 'one.csv']) == 0
     table = np.genfromtxt('one.csv', delimiter=',', names=True)
-    one = frame[frame.recording == str(archive / 'archive' / 'one.mcap')]
+    rows = frame[frame.recording == str(archive / 'archive' / 'one.mcap')]
     for name in ('dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta'):
-        assert np.array_equal(one[name], table[name]), name
+        assert np.array_equal(rows[name], table[name]), name
     schema = parquet.read_schema('all.parquet')
     assert schema.field('dx').metadata == {b'unit': b'm'}
     (failed,) = json.loads(parquet.read_metadata('all.parquet').metadata[FAILED.encode()]).items()
@@ -105,9 +105,9 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
     frame = pandas.read_parquet('rows.parquet')
     assert frame.error.tolist() == ['', f'{archive}/nowhere.csv: no such recording']
     assert frame.result[0] == files['calibration.json'].read_text()
-    for name, one in json.loads(frame.result[0])['parameters'].items():
-        assert frame[name][0] == one['value']
-        assert frame[f'sd {name}'][0] == one['sd']
+    for name, fitted in json.loads(frame.result[0])['parameters'].items():
+        assert frame[name][0] == fitted['value']
+        assert frame[f'sd {name}'][0] == fitted['sd']
 
 
 def test_folders_are_those_of_the_archive(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert max(len(line) for line in lines) <= 120
     end = next(i for i, line in enumerate(lines) if line.startswith('Section 2.3'))
     rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in methods()}
-    assert all(len(found) == 2 for found in rows.values())
+    assert all(len(cells) == 2 for cells in rows.values())
     rms, largest = rows['exact (default)']
     assert '0 / 0 / 0' in rms
     assert '3.34 / 2.67 / 1.83' in rms

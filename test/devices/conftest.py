@@ -200,10 +200,10 @@ def served(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[[LineDevi
     numbers = itertools.count()
 
     def make(device: LineDevice) -> Served:
-        one = Served(tmp_path / f'port_{next(numbers)}')
-        one.plug(device)
-        request.addfinalizer(one.unplug)
-        return one
+        port = Served(tmp_path / f'port_{next(numbers)}')
+        port.plug(device)
+        request.addfinalizer(port.unplug)
+        return port
 
     return make
 
@@ -214,12 +214,12 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
     made: list[Wired] = []
 
     def make(device: LineDevice) -> Wired:
-        one = Wired(f'port_{len(made)}', clock)
-        one.plug(device)
-        made.append(one)
-        return one
+        port = Wired(f'port_{len(made)}', clock)
+        port.plug(device)
+        made.append(port)
+        return port
 
-    def port(name: str, baud: int, **others: object) -> WiredPort:
+    def port(name: str, baud: int, **settings: object) -> WiredPort:
         return WiredPort(made, name)
 
     def select(ports: Sequence[int], _: object, __: object, timeout: float) -> None:
@@ -238,9 +238,9 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
 @pytest.fixture
 def run(request: pytest.FixtureRequest) -> Callable[[Rig], Run]:
     def make(rig: Rig) -> Run:
-        one = Run(rig)
-        request.addfinalizer(one.acquisition.stop)
-        return one
+        running = Run(rig)
+        request.addfinalizer(running.acquisition.stop)
+        return running
 
     return make
 

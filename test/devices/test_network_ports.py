@@ -55,7 +55,7 @@ class Connected:
 
     def __init__(self, listener: socket.socket) -> None:
         self.port = open_port(named(listener), BAUD)
-        self.far, _ = listener.accept()
+        self.peer, _ = listener.accept()
 
 
 @pytest.fixture
@@ -63,30 +63,30 @@ def connected(listener: socket.socket) -> Iterator[Connected]:
     made = Connected(listener)
     yield made
     made.port.close()
-    made.far.close()
+    made.peer.close()
 
 
 def test_bytes_go_both_ways(connected: Connected) -> None:
-    connected.far.sendall(b'\x00hello\x00')
+    connected.peer.sendall(b'\x00hello\x00')
     assert all_of(connected.port, 7) == b'\x00hello\x00'
     connected.port.write(b'question')
-    assert connected.far.recv(100) == b'question'
+    assert connected.peer.recv(100) == b'question'
     assert connected.port.read(0.0) == b''
     assert connected.port.notices() == []
 
 
 def test_old_bytes_are_discarded(connected: Connected) -> None:
-    connected.far.sendall(b'old' * 1000)
+    connected.peer.sendall(b'old' * 1000)
     fd = connected.port.fileno()
     assert fd is not None
     select.select((fd,), (), (), WAIT_S)
     connected.port.discard_input()
-    connected.far.sendall(b'new')
+    connected.peer.sendall(b'new')
     assert all_of(connected.port, 3).endswith(b'new')
 
 
 def test_the_other_end_closes(connected: Connected) -> None:
-    connected.far.close()
+    connected.peer.close()
     with pytest.raises(PortClosedError, match=r'socket://127.0.0.1:\d+: the device is gone \(the other end closed'):
         all_of(connected.port, 1)
     # To discard is no reason to fail: the next read tells.
@@ -94,8 +94,8 @@ def test_the_other_end_closes(connected: Connected) -> None:
 
 
 def test_the_other_end_breaks_off(connected: Connected) -> None:
-    connected.far.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b'\x01\x00\x00\x00\x00\x00\x00\x00')
-    connected.far.close()
+    connected.peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b'\x01\x00\x00\x00\x00\x00\x00\x00')
+    connected.peer.close()
     with pytest.raises(PortClosedError, match='the device is gone'):
         all_of(connected.port, 1)
     with pytest.raises(PortClosedError, match='cannot be written to'):
@@ -271,7 +271,7 @@ def test_what_strangers_send_is_bounded(udp: Datagrammed) -> None:
     # Memory is bounded, and nothing public says how much is kept of a stranger.
     candidates = udp.port._candidates
     assert len(candidates) == MOST_SENDERS
-    assert all(len(one.last_bytes) <= KEPT for one in candidates.values())
+    assert all(len(candidate.last_bytes) <= KEPT for candidate in candidates.values())
     device = udp.sender()
     device.send(b'device')
     assert all_of(udp.port, 6) == b'device'

@@ -34,8 +34,8 @@ def install(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str, entry_poin
 
 @pytest.fixture
 def code() -> str:
-    (found,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.DOTALL)
-    return str(found)
+    (block,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.DOTALL)
+    return str(block)
 
 
 @pytest.fixture
@@ -83,9 +83,9 @@ def test_the_survey_recognises_it(
     (twin,) = simulate(unloaded(load_rig()), PowerUp())
     port = str(served(twin).link)
     assert main(['devices', '--json', port]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found['suggested'] == [{'source': NAME, 'port': port}]
-    assert found['ports'][0]['answer'] == 'my converter 7'
+    tree = json.loads(capsys.readouterr().out)
+    assert tree['suggested'] == [{'source': NAME, 'port': port}]
+    assert tree['ports'][0]['answer'] == 'my converter 7'
 
 
 def test_one_without_a_twin_is_rejected_where_a_twin_is_needed(

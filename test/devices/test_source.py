@@ -255,5 +255,5 @@ def test_each_of_ours_gives_up_waiting(name: str, tmp_path: Path, monkeypatch: p
         if not thread.is_alive():
             break
     assert 'given up' in str(outcome.get(timeout=WAIT_S))
-    for one in ports:
-        one.close()
+    for opened in ports:
+        opened.close()

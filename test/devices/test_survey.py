@@ -71,9 +71,9 @@ def test_something_else_is_reported_to_be_something_else(served: Any, monkeypatc
         def take(self, since_power_up_ns: int, room: int = 4096) -> bytes:
             return b'$GPGGA,123519\r\n'
 
-    (found,) = survey(known_devices()[0], [str(served(Other()).link)])
-    assert found.source == ''
-    assert 'bytes that we cannot read at 921600 baud' in found.answer
+    (device,) = survey(known_devices()[0], [str(served(Other()).link)])
+    assert device.source == ''
+    assert 'bytes that we cannot read at 921600 baud' in device.answer
 
 
 def test_the_system_s_list_is_taken_without_the_fixed_ports(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,8 +90,8 @@ def test_a_line_has_400_bytes_at_most(cut: int) -> None:
         line = b'7,7000,0.1,-0.2,5,0,1.5,4.75'.ljust(size) + b'\n'
         decoder = LineDecoder()
         decoder.feed(b'\n')
-        found = decoder.feed(line[:cut]) + decoder.feed(line[cut:])
-        assert found == ([LINE] if size == 400 else [BadFrame('longer than a line', 401)])
+        decoded = decoder.feed(line[:cut]) + decoder.feed(line[cut:])
+        assert decoded == ([LINE] if size == 400 else [BadFrame('longer than a line', 401)])
 
 
 def test_a_whole_line_that_comes_first_is_a_line() -> None:
@@ -139,7 +139,7 @@ def test_micros_going_back_at_same_number_is_a_restart() -> None:
 
 
 @pytest.mark.parametrize(
-    ('ahead', 'earlier_us', 'turns'),
+    ('ahead', 'earlier_us', 'wraps'),
     [
         # A line of the next number, or of a later one less than half way round; the clock goes back more than half way.
         (1, 2**31 + 1, 1),
@@ -149,11 +149,11 @@ def test_micros_going_back_at_same_number_is_a_restart() -> None:
         (1, 2**31, 0),
     ],
 )
-def test_what_a_clock_that_goes_back_means(ahead: int, earlier_us: int, turns: int) -> None:
+def test_what_a_clock_that_goes_back_means(ahead: int, earlier_us: int, wraps: int) -> None:
     extender = TimeExtender()
     now = 3_000_000_000
     extender.extend(Line(1000, now, VALUES))
-    assert extender.extend(Line(1000 + ahead, now - earlier_us, VALUES)) == turns * 2**32 + now - earlier_us
+    assert extender.extend(Line(1000 + ahead, now - earlier_us, VALUES)) == wraps * 2**32 + now - earlier_us
 
 
 def test_the_same_line_again_is_of_the_same_time() -> None:
@@ -163,17 +163,17 @@ def test_the_same_line_again_is_of_the_same_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ('behind', 'earlier_us', 'again'), [(63, 1000, True), (64, 1000, False), (10, 2**31 - 1, True), (10, 2**31, False)]
+    ('lag', 'earlier_us', 'again'), [(63, 1000, True), (64, 1000, False), (10, 2**31 - 1, True), (10, 2**31, False)]
 )
-def test_a_line_that_comes_again_does_not_turn_back_the_clock(behind: int, earlier_us: int, again: bool) -> None:
+def test_a_line_that_comes_again_does_not_turn_back_the_clock(lag: int, earlier_us: int, again: bool) -> None:
     """Less than 64 numbers and half a turn of the clock back; else the device has started again."""
     extender = TimeExtender()
     now = 3_000_000_000
     for seq, t_us in ((998, 2**32 - 1000), (999, 500), (1000, now)):
         extender.extend(Line(seq, t_us, VALUES))
-    turn = 2**32 if again else 0
-    assert extender.extend(Line(1000 - behind, now - earlier_us, VALUES)) == turn + now - earlier_us
-    assert extender.extend(Line(1001, now + 1, VALUES)) == turn + now + 1
+    wrap = 2**32 if again else 0
+    assert extender.extend(Line(1000 - lag, now - earlier_us, VALUES)) == wrap + now - earlier_us
+    assert extender.extend(Line(1001, now + 1, VALUES)) == wrap + now + 1
 
 
 @pytest.mark.parametrize(('seq', 'again'), [(64, False), (65, True)])
@@ -313,7 +313,7 @@ def test_three_psds(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ('info', 'line', 'found'),
+    ('info', 'line', 'result'),
     [
         (b'"psds": 3', b'1,1000,0,0,5,0,0,5,0,1,5', (0, 0, 5, 0, 0, 5, 0, 1, 5)),
         (b'"psds": 3', b'1,1000,0,0,5,0,0,5', '6 readings where the description says 9'),
@@ -321,10 +321,10 @@ def test_three_psds(wired: Any, run: Any, unloaded: Any, volts: Any) -> None:
         (b'"psds": 3', b'1,1000,0,0,5,0,0,5,0', 'no number of fields that a sample has'),
     ],
 )
-def test_a_line_of_three_psds(wired: Any, info: bytes, line: bytes, found: object) -> None:
+def test_a_line_of_three_psds(wired: Any, info: bytes, line: bytes, result: object) -> None:
     hello, event = sent(wired, info, line, **{'psd_3.center': [0.08, 0.0]})
     assert (hello.info['psds'], hello.info['channels']) == (3, list(channel_names(3)))
-    assert (event.reason if isinstance(event, BadFrame) else event.readings) == found
+    assert (event.reason if isinstance(event, BadFrame) else event.readings) == result
 
 
 @given(st.integers(1, 60), st.floats(-900.0, 900.0))

@@ -393,11 +393,11 @@ class Held(SimulatedDataq):
     trials = 0
 
     def due_in_ns(self, since_power_up_ns: int) -> int:
-        due = super().due_in_ns(since_power_up_ns)
-        if self._scanning and self._sent == 200 and due > 0 and self.trials:
+        delay = super().due_in_ns(since_power_up_ns)
+        if self._scanning and self._sent == 200 and delay > 0 and self.trials:
             self.trials -= 1
-            return due + 200_000_000
-        return due
+            return delay + 200_000_000
+        return delay
 
 
 @pytest.mark.parametrize('trials', [0, 1, 3])

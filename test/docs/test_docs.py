@@ -53,8 +53,8 @@ def test_every_command_is_run() -> None:
 
 def test_a_page_has_what_its_lines_of_pip_add() -> None:
     names = [str(page.relative_to(ROOT)) for page in (*PAGES, *run_commands.NOTEBOOKS)]
-    found = {name: run_commands.extras_of(name) for name in names}
-    assert {page: wanted for page, wanted in found.items() if wanted} == {
+    extras = {name: run_commands.extras_of(name) for name in names}
+    assert {page: wanted for page, wanted in extras.items() if wanted} == {
         'docs/api.md': ['pandas>=2.1', 'xarray>=2024.1'],
         'docs/commands.md': ['shtab'],
         'docs/camera.md': ['opencv-python-headless>=4.6'],
@@ -112,8 +112,8 @@ def anchors(page: Path) -> set[str]:
 
 def links(page: Path) -> list[str]:
     """The targets of its links within the repository."""
-    found = re.findall(r'\]\(([^)\s]+)(?: "[^"]*")?\)', FENCE.sub('', page.read_text()))
-    return [target for target in found if not target.startswith(('http://', 'https://', 'mailto:'))]
+    targets = re.findall(r'\]\(([^)\s]+)(?: "[^"]*")?\)', FENCE.sub('', page.read_text()))
+    return [target for target in targets if not target.startswith(('http://', 'https://', 'mailto:'))]
 
 
 def linked(page: Path) -> set[Path]:
@@ -172,9 +172,9 @@ QUESTIONS = {
 
 
 def test_newcomer_questions_are_answered_near_readme() -> None:
-    docs, near = ROOT / 'docs', near_readme()
+    docs, linked = ROOT / 'docs', near_readme()
     asked = {q: (docs / name, words) for q, (name, words) in QUESTIONS.items()}
-    assert [q for q, (page, words) in asked.items() if page not in near or words not in page.read_text()] == []
+    assert [q for q, (page, words) in asked.items() if page not in linked or words not in page.read_text()] == []
 
 
 def named(tree: Any) -> list[str]:

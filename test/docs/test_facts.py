@@ -60,12 +60,12 @@ def test_every_parameter_that_a_page_sets_is_declared() -> None:
 
 def rows(page: str) -> dict[str, list[str]]:
     """The first three cells of each row whose first cell has names, by name; several names share a row."""
-    found: dict[str, list[str]] = {}
+    cells_by_name: dict[str, list[str]] = {}
     for line in (ROOT / 'docs' / page).read_text('utf-8').splitlines():
         cells = [cell.strip() for cell in line.strip('|').split('|')]
         for name in re.findall('`([^`]+)`', cells[0]) if line.startswith('| `') else []:
-            found[name] = cells[1:3]
-    return found
+            cells_by_name[name] = cells[1:3]
+    return cells_by_name
 
 
 @pytest.mark.parametrize('name', ['max_step', 'lead'])
@@ -77,7 +77,7 @@ def test_defaults_of_the_shaper_are_on_its_page(name: str) -> None:
 def test_defaults_of_the_camera_are_on_its_page() -> None:
     stated = rows('camera.md')
     declared = Section(CameraSettings).parameters
-    for names in (('spacing', 'radius'), ('square', 'marker', 'gap'), ('turn',), ('exposure',), ('rest_frames',)):
+    for names in (('spacing', 'radius'), ('square', 'marker', 'gap'), ('rotation',), ('exposure',), ('rest_frames',)):
         given = [float(number) for number in stated[declared[names[0]].name][1].split(', ')]
         assert given == [declared[name].default for name in names]
 
@@ -172,8 +172,8 @@ def test_every_number_of_the_thesis_has_one_row_with_its_state() -> None:
     page = (ROOT / 'docs' / 'audit.md').read_text(encoding='utf-8')
     rows = [line.strip('|').split('|') for line in page.split('## Every number')[1].splitlines() if line[:1] == '|']
     rows = [[cell.strip() for cell in row] for row in rows if row[0].strip('- ') not in ('', 'number')]
-    found = [number for row in rows for number in spelled(row[0])]
-    assert sorted(found) == sorted(EVERY)
+    numbers = [number for row in rows for number in spelled(row[0])]
+    assert sorted(numbers) == sorted(EVERY)
     assert {row[1] for row in rows} <= set(STATES)
     assert all(row[2] for row in rows)
 

@@ -93,13 +93,13 @@ def test_block_middle_is_independent_of_lost_samples(slots: list[int], index: in
 
 
 def test_a_repeat_in_the_first_chunk_is_passed_over_too() -> None:
-    for seq, kept in (([4, 4], [4]), ([4, 3], [4]), ([0, 0], [0]), ([5, 3, 4, 6, 6, 7], [5, 6, 7])):
+    for seq, selected in (([4, 4], [4]), ([4, 3], [4]), ([0, 0], [0]), ([5, 3, 4, 6, 6, 7], [5, 6, 7])):
         cutter = BlockCutter(20)
         cutter.add(*chunk_of(seq))
-        assert cutter.repeated == len(seq) - len(kept)
+        assert cutter.repeated == len(seq) - len(selected)
         (block,) = cutter.flush()
-        assert block.seq.tolist() == kept
-        assert block.volts[:, 0].tolist() == kept
+        assert block.seq.tolist() == selected
+        assert block.volts[:, 0].tolist() == selected
         assert (block.t_ns == block.seq * 1_000_000).all()
 
 
@@ -162,10 +162,10 @@ def test_golden_bits_are_same_for_any_chunk_size(name: str) -> None:
     columns = zip(*[(b.seq, b.t_ns, b.volts, b.flags) for b in recording.blocks()], strict=True)
     seq, t_ns, volts, flags = (np.concatenate(column) for column in columns)
     samples, rig = RawChunk(seq, t_ns, volts, flags), rig_at_start(recording)
-    one = list(in_chunks(rig, samples, 1))
-    assert len(one) > 900
+    single = list(in_chunks(rig, samples, 1))
+    assert len(single) > 900
     for blocks in (7, 50, 1000):
-        assert list(in_chunks(rig, samples, blocks)) == one
+        assert list(in_chunks(rig, samples, blocks)) == single
 
 
 @pytest.mark.parametrize('seed', [0, pytest.param(1, marks=pytest.mark.slow)])
@@ -183,12 +183,12 @@ def test_random_blocks_have_same_bits_in_any_batch(seed: int) -> None:
         volts[start : start + 150, rng.integers(psds) * 3 + 2] -= 5.0
     start = int(rng.integers(0, n))
     volts[start : start + 300, :3] = volts[start, :3]
-    kept: IntArray = np.flatnonzero(rng.random(n) > 0.15 * (np.arange(n) // 500 % 2))
-    flags = np.where(rng.random(len(kept)) < 2e-4, FLAG_OVER_RANGE, 0).astype(np.uint8)
-    samples = RawChunk(kept, kept * 1_000_000, volts[kept].astype(np.float32), flags)
-    one = list(in_chunks(rig, samples, 1))
+    received: IntArray = np.flatnonzero(rng.random(n) > 0.15 * (np.arange(n) // 500 % 2))
+    flags = np.where(rng.random(len(received)) < 2e-4, FLAG_OVER_RANGE, 0).astype(np.uint8)
+    samples = RawChunk(received, received * 1_000_000, volts[received].astype(np.float32), flags)
+    single = list(in_chunks(rig, samples, 1))
     for blocks in (7, 1000):
-        assert list(in_chunks(rig, samples, blocks)) == one
+        assert list(in_chunks(rig, samples, blocks)) == single
 
 
 def test_measures_are_those_of_numpy() -> None:

@@ -43,12 +43,12 @@ def test_the_variance_of_a_held_twist_grows_to_that_of_any_twist(seconds: float)
     blocks = 1 + round(seconds / 0.02)
     volts = at_rest(blocks)
     volts[20:, :3] = 0.0
-    found = estimates(volts, {'degraded': 'hold', 'twist_sd': 0.01, 'twist_hold': 0.7})
-    assert len(found) == blocks
-    first, last = (np.array(e.covariance).reshape(3, 3) for e in (found[0], found[-1]))
+    held = estimates(volts, {'degraded': 'hold', 'twist_sd': 0.01, 'twist_hold': 0.7})
+    assert len(held) == blocks
+    first, last = (np.array(e.covariance).reshape(3, 3) for e in (held[0], held[-1]))
     want = first[2, 2] + 1e-4 * (1.0 - math.exp(-seconds / 0.7))
     assert last[2, 2] == pytest.approx(want, rel=1e-11, abs=0.0)
-    assert found[-1].theta == found[0].theta
+    assert held[-1].theta == held[0].theta
     # PSD 2 is 0.1 m from the tip's axis along -X: a twist moves its dot in y.
     assert last[1, 1] - last[0, 0] == pytest.approx(0.1**2 * want, rel=1e-3)
 
@@ -60,17 +60,17 @@ def test_a_twist_is_not_held_for_less_than_no_time(earlier_ms: int) -> None:
     first, dark = chunk(at_rest(1)), at_rest(1)
     dark[:, :3] = 0.0
     second = replace(chunk(dark, 20), t_ns=first.t_ns - earlier_ms * 1_000_000)
-    found = [r for c in (first, second) for r in pipeline.process(c) if isinstance(r, DeflectionEstimate) and r.primary]
-    assert found[1].covariance[8] == found[0].covariance[8]
-    assert (found[1].solver, found[1].phi, found[1].omega, found[1].residual_rms) == ('one_psd', 0.0, 0.0, 0.0)
+    held = [r for c in (first, second) for r in pipeline.process(c) if isinstance(r, DeflectionEstimate) and r.primary]
+    assert held[1].covariance[8] == held[0].covariance[8]
+    assert (held[1].solver, held[1].phi, held[1].omega, held[1].residual_rms) == ('one_psd', 0.0, 0.0, 0.0)
 
 
 def test_a_twist_that_is_taken_for_none_is_as_unsure_as_any() -> None:
     volts = at_rest(1)
     volts[:, :3] = 0.0
-    (found,) = estimates(volts, {'degraded': 'zero', 'twist_sd': 0.02})
-    assert (found.theta, found.covariance[8]) == (0.0, 0.02**2)
-    assert found.covariance[4] - found.covariance[0] == pytest.approx(0.1**2 * 0.02**2, rel=1e-9)
+    (estimate,) = estimates(volts, {'degraded': 'zero', 'twist_sd': 0.02})
+    assert (estimate.theta, estimate.covariance[8]) == (0.0, 0.02**2)
+    assert estimate.covariance[4] - estimate.covariance[0] == pytest.approx(0.1**2 * 0.02**2, rel=1e-9)
 
 
 BASE = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
@@ -99,34 +99,34 @@ def test_other_light_may_come_from_anywhere_on_the_active_area() -> None:
     length, share = 10e-3, (8.0 - 5.0) / 8.0
     dark, bright = (np.array(estimates(at_rest(1, v), {})[0].covariance) for v in (5.0, 8.0))
     # Readings of one variance v: that of the twist is v over the sum of squares about the middle of the base line.
-    own = dark[8] * (0.1**2 + 0.07**2) / 2.0
-    np.testing.assert_allclose(bright, dark * (1.0 + (share * length / 2.0) ** 2 / 3.0 / own), rtol=1e-6, atol=1e-20)
+    sigma2 = dark[8] * (0.1**2 + 0.07**2) / 2.0
+    np.testing.assert_allclose(bright, dark * (1.0 + (share * length / 2.0) ** 2 / 3.0 / sigma2), rtol=1e-6, atol=1e-20)
 
 
 def test_a_finding_that_says_nothing_of_light_leaves_the_covariance() -> None:
     """Sums above their limit, and not above what is nominal; in the second block of one PSD alone."""
     volts = at_rest(2)
     volts[20:, :3] = 0.0
-    quiet, found = (estimates(volts, {'sum_max': most, 'degraded': 'zero'}) for most in (8.0, 4.5))
-    assert [e.solver for e in found] == ['exact', 'one_psd']
-    assert found == quiet
+    quiet, bright = (estimates(volts, {'sum_max': most, 'degraded': 'zero'}) for most in (8.0, 4.5))
+    assert [e.solver for e in bright] == ['exact', 'one_psd']
+    assert bright == quiet
 
 
 def test_half_the_light_doubles_the_noise_of_one_detector() -> None:
     """Where both are lit by half, and the spot of one leaves its area; a twist that is none adds no variance."""
-    found = []
+    lit = []
     for total in (5.0, 2.5):
         volts = at_rest(1, total)
         volts[:, 0] = 10.0
-        found += estimates(volts, {'splitter': True, 'degraded': 'zero', 'twist_sd': 1e-12})
-    assert [e.solver for e in found] == ['one_psd', 'one_psd']
-    np.testing.assert_allclose(found[1].covariance[:5], 4.0 * np.array(found[0].covariance[:5]), rtol=1e-9, atol=1e-20)
+        lit += estimates(volts, {'splitter': True, 'degraded': 'zero', 'twist_sd': 1e-12})
+    assert [e.solver for e in lit] == ['one_psd', 'one_psd']
+    np.testing.assert_allclose(lit[1].covariance[:5], 4.0 * np.array(lit[0].covariance[:5]), rtol=1e-9, atol=1e-20)
 
 
 def calibrated(**sds: float) -> dict[str, object]:
     """A calibration that left these standard deviations; a name with ``__`` for the dot."""
-    left = {name.replace('__', '.'): sd for name, sd in sds.items()}
-    return {'calibration.names': [*INDEX], 'calibration.sds': [left.get(name, 0.0) for name in INDEX]}
+    by_name = {name.replace('__', '.'): sd for name, sd in sds.items()}
+    return {'calibration.names': [*INDEX], 'calibration.sds': [by_name.get(name, 0.0) for name in INDEX]}
 
 
 def test_the_chi_square_allows_for_what_a_calibration_left_open() -> None:
@@ -135,9 +135,9 @@ def test_the_chi_square_allows_for_what_a_calibration_left_open() -> None:
     volts[:, 0] = 20e-6 / 5e-4
     sure, unsure = (estimates(volts, calibrated(psd_1__zero_x=sd))[0] for sd in (0.0, 3e-6))
     square = 0.1**2 / (0.1**2 + 0.07**2) / 2.0
-    own = square * (20e-6) ** 2 / sure.chi_square
-    assert own == pytest.approx((2e-3 * 5e-4) ** 2 / 20.0, rel=0.05)
-    assert unsure.chi_square == pytest.approx(square * (20e-6) ** 2 / (own + square * (3e-6) ** 2), rel=1e-3)
+    variance = square * (20e-6) ** 2 / sure.chi_square
+    assert variance == pytest.approx((2e-3 * 5e-4) ** 2 / 20.0, rel=0.05)
+    assert unsure.chi_square == pytest.approx(square * (20e-6) ** 2 / (variance + square * (3e-6) ** 2), rel=1e-3)
 
 
 @pytest.mark.parametrize('psd', [0, 1])
@@ -162,8 +162,8 @@ def test_zero_variance_of_single_psd_follows_rotation(psd: int, axis: int) -> No
     assert unsure.pose == pytest.approx((1e-3, 2e-3, theta), abs=1e-6)
     more = (np.array(unsure.covariance) - sure.covariance).reshape(3, 3)
     g = -slope @ (beams[psd] + dot)
-    own = np.diag([1e-8 if i == axis else 0.0 for i in range(2)])
-    np.testing.assert_allclose(more[:2, :2], own + more[2, 2] * np.outer(g, g), rtol=1e-3, atol=1e-12)
+    of_zero = np.diag([1e-8 if i == axis else 0.0 for i in range(2)])
+    np.testing.assert_allclose(more[:2, :2], of_zero + more[2, 2] * np.outer(g, g), rtol=1e-3, atol=1e-12)
 
 
 def test_calibration_covariance_is_reported_beside_noise() -> None:
@@ -172,8 +172,8 @@ def test_calibration_covariance_is_reported_beside_noise() -> None:
     covariances = []
     for values in (rig, {**rig, 'covariance': 'noise'}):
         pipeline = Pipeline(load_rig(overrides=values))
-        (found,) = (r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate) and r.primary)
-        covariances.append(np.array(found.covariance).reshape(3, 3))
+        (record,) = (r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate) and r.primary)
+        covariances.append(np.array(record.covariance).reshape(3, 3))
         if values is rig:
             reported = pipeline.estimation.systematic
         else:
@@ -204,10 +204,10 @@ def test_inconsistent_readings_are_rejected_on_request() -> None:
 
 def test_a_method_without_a_covariance_has_none() -> None:
     pipeline = Pipeline(load_rig(overrides={'solvers': ['exact', 'iterative_printed', 'wls']}))
-    found = {r.solver: r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate)}
-    assert list(found) == ['exact', 'iterative_printed', 'wls']
-    assert np.isnan(found['iterative_printed'].covariance).all()
-    assert not np.isnan(found['wls'].covariance).any()
+    by_solver = {r.solver: r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate)}
+    assert list(by_solver) == ['exact', 'iterative_printed', 'wls']
+    assert np.isnan(by_solver['iterative_printed'].covariance).all()
+    assert not np.isnan(by_solver['wls'].covariance).any()
 
 
 REST = np.zeros((2, 4))
@@ -249,10 +249,10 @@ def test_ambient_light_is_removed_with_sum_of_its_psd(psd: int) -> None:
     light = correction({'name': 'ambient_light', 'psd': psd, 'level': 0.5, 'x': 1e-3, 'y': -2e-3})
     dots = np.array([[1e-4, 2e-4, 3e-4, 4e-4]])
     column = 2 * psd - 2
-    for sums, own in ((None, 5.0), (np.array([[4.0, 3.0]]), 5.0 - psd)):
+    for sums, total in ((None, 5.0), (np.array([[4.0, 3.0]]), 5.0 - psd)):
         wanted = dots.copy()
         read = dots[0, column : column + 2]
-        wanted[0, column : column + 2] = (own * read - 0.5 * np.array([1e-3, -2e-3])) / (own - 0.5)
+        wanted[0, column : column + 2] = (total * read - 0.5 * np.array([1e-3, -2e-3])) / (total - 0.5)
         np.testing.assert_allclose(light.apply(dots, sums), wanted, rtol=1e-12)
 
 
@@ -291,9 +291,9 @@ def test_the_pose_is_found_in_three_passes() -> None:
     for _ in range(3):
         points = centers + dots
         from_middle = points - points.mean(), centers - centers.mean()
-        turn = cmath.phase(np.sum(from_middle[0].conj() * from_middle[1]))
-        moved = centers.mean() - cmath.exp(1j * turn) * points.mean()
-        dots = read - (shown(turn, moved, centers + off) - shown(turn, moved, centers))
+        angle = cmath.phase(np.sum(from_middle[0].conj() * from_middle[1]))
+        moved = centers.mean() - cmath.exp(1j * angle) * points.mean()
+        dots = read - (shown(angle, moved, centers + off) - shown(angle, moved, centers))
     given = np.column_stack([read.real, read.imag]).reshape(1, 4)
     got = correction({'name': 'sensor_position', 'psd': 1, 'x': 5e-3, 'y': 3e-3}).apply(given)
     np.testing.assert_allclose(got, np.column_stack([dots.real, dots.imag]).reshape(1, 4), atol=1e-13)

@@ -66,11 +66,11 @@ def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
     rig = load_rig(overrides={'degraded': rule})
     pipeline = Pipeline(rig)
     records = records_of(pipeline, dark(moving(40), psd, slice(10, 30)))
-    found = primaries(records)
-    assert sorted(found) == list(range(40))
-    full = found[9]
+    by_block = primaries(records)
+    assert sorted(by_block) == list(range(40))
+    full = by_block[9]
     for block in range(10, 30):
-        e = found[block]
+        e = by_block[block]
         assert e.solver == 'one_psd'
         assert e.theta == (full.theta if rule == 'hold' else 0.0)
         # What is claimed holds: the error is within four of its standard deviations.
@@ -79,15 +79,15 @@ def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
         assert (np.abs(error) < 4 * np.sqrt(np.diag(covariance))).all()
         assert np.linalg.eigvalsh(covariance).min() > 0
         assert e.covariance[8] > full.covariance[8]
-    assert found[30].solver == 'exact'
+    assert by_block[30].solver == 'exact'
     # What a block shows of motion differs from block to block, and with it the covariance, by a few per cent.
-    np.testing.assert_allclose(found[30].covariance, full.covariance, rtol=0.1)
+    np.testing.assert_allclose(by_block[30].covariance, full.covariance, rtol=0.1)
     assert pipeline.counters.degraded == 20
     assert pipeline.counters.rejected == {}
     statuses = [s.status for s in spots(records)]
     assert statuses[10:30] == [BlockStatus.LASER_LOST] * 20
     loads = {r.t_ns for r in records if isinstance(r, TipLoad)}
-    assert not loads & {found[b].t_ns for b in range(10, 30)}
+    assert not loads & {by_block[b].t_ns for b in range(10, 30)}
     pipeline = Pipeline(rig)
     records_of(pipeline, dark(moving(10), psd, slice(5, 10)))
     assert pipeline.zero() is None
@@ -128,8 +128,8 @@ def noisy_blocks(blocks: int, volts: float) -> Counts:
 
 def levels_of(pipeline: Pipeline, counts: Counts, first: int = 0) -> list[float]:
     """The level, mV, that each finding names."""
-    found = [f for spot in spots(records_of(pipeline, counts, first)) for f in spot.findings if 'is noisy' in f]
-    return [float(f.partition(': ')[2].removesuffix(' mV a sample')) for f in found]
+    noisy = [f for spot in spots(records_of(pipeline, counts, first)) for f in spot.findings if 'is noisy' in f]
+    return [float(f.partition(': ')[2].removesuffix(' mV a sample')) for f in noisy]
 
 
 def test_the_noise_that_is_named_is_that_of_many_blocks() -> None:

@@ -90,8 +90,8 @@ def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: t
     rms = np.sqrt(((got - pose) ** 2).mean(axis=0))
     assert (rms <= 1.1 * BOUND_2UM * SCALE).all(), rms / (BOUND_2UM * SCALE)
     assert (rms >= 0.9 * BOUND_2UM * SCALE).all(), rms / (BOUND_2UM * SCALE)
-    one = next(r for r in records if isinstance(r, DeflectionEstimate) and r.primary)
-    stated = np.sqrt(np.array(one.covariance).reshape(3, 3).diagonal())
+    estimate = next(r for r in records if isinstance(r, DeflectionEstimate) and r.primary)
+    stated = np.sqrt(np.array(estimate.covariance).reshape(3, 3).diagonal())
     np.testing.assert_allclose(stated, BOUND_2UM * SCALE, rtol=0.02)
     wrench = np.array([(r.fx, r.fy, r.tz) for r in records if isinstance(r, TipLoad)]).mean(axis=0)
     np.testing.assert_allclose(wrench, load, atol=5e-3)
@@ -451,9 +451,9 @@ def test_decimation_keeps_estimates_and_thins_the_rest(size: int, every: int) ->
         primary = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
         poses[reported] = [(*r.pose, *r.covariance) for r in primary]
         assert [r.index for r in records if isinstance(r, SpotMeans)] == list(range(240))
-        due = [r.index for r in records if isinstance(r, SpotMeans) and r.published]
-        assert due == list(range(0, 240, reported))
-        assert {r.block for r in records if isinstance(r, DeflectionEstimate) and not r.primary} == set(due)
+        indices = [r.index for r in records if isinstance(r, SpotMeans) and r.published]
+        assert indices == list(range(0, 240, reported))
+        assert {r.block for r in records if isinstance(r, DeflectionEstimate) and not r.primary} == set(indices)
     assert published[1] == dict.fromkeys(names, 240)
     assert published[every] == dict.fromkeys(names[:3], 240) | dict.fromkeys(names[3:], 240 // every)
     assert poses[every] == poses[1]

@@ -50,7 +50,7 @@ def test_a_solver_that_needs_all_psds_says_so_of_each_block() -> None:
     """Where the beams of a subset meet in one point, it has no twist."""
     one_place, apart = (rig_from_values({'psd_3.center': [x, y]}) for x, y in (RIG.centers[0].tolist(), (0.0, 0.06)))
     solvers = SolverSet(one_place)
-    some = ReadingsRun(solvers, PsdSet(apart, (0, 2), 'none'), [(0.0,) * 4] * 2, (1e-12,) * 4, np.zeros((2, 4, 4)))
+    subset = ReadingsRun(solvers, PsdSet(apart, (0, 2), 'none'), [(0.0,) * 4] * 2, (1e-12,) * 4, np.zeros((2, 4, 4)))
     assert solvers.of(0, (0, 2)) is None
-    assert {some.answer(0, at).failure for at in (0, 1)} == {'exact: takes all PSDs'}
-    assert some.answer(1, 0).solution is None
+    assert {subset.answer(0, at).failure for at in (0, 1)} == {'exact: takes all PSDs'}
+    assert subset.answer(1, 0).solution is None

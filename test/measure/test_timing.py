@@ -144,12 +144,12 @@ def test_a_rate_that_wanders_costs_less_than_300_us(ppm: float) -> None:
 def test_the_last_five_minutes_count_and_no_more() -> None:
     """A clock that is right for ten minutes and then 50 ppm off, on a line without jitter."""
     clock = ClockMap()
-    turn = 600 * 10
-    for k in range(turn + 320 * 10):
-        late = 0 if k < turn else round((k - turn) * 100 * MS * 50e-6)
+    change = 600 * 10
+    for k in range(change + 320 * 10):
+        late = 0 if k < change else round((k - change) * 100 * MS * 50e-6)
         clock.observe(100_000 * k, 100 * MS * k + 200_000 + late)
         clock.to_host_ns(np.array([100_000 * k], np.int64))
-        if k == turn:
+        if k == change:
             assert clock.state().points == 300
             assert clock.state().skew_ppm == pytest.approx(0.0, abs=1e-3)
     assert clock.state().points == 300
@@ -312,15 +312,15 @@ def test_lower_line_is_closest_of_lines_below_points() -> None:
     for _ in range(100):
         x = rng.choice(50, int(rng.integers(2, 9)), replace=False)
         points = [(int(a), int(b)) for a, b in zip(x, rng.integers(-20, 20, len(x)), strict=True)]
-        far = []
+        sums = []
         for (a, y), (b, z) in itertools.combinations(points, 2):
             over = [q - y - (z - y) / (b - a) * (p - a) for p, q in points]
             if min(over) > -1e-9:
-                far.append(sum(over))
+                sums.append(sum(over))
         slope, intercept = lower_line(points)
         over = [q - slope * p - intercept for p, q in points]
         assert min(over) > -1e-9
-        assert sum(over) == pytest.approx(min(far), abs=1e-9)
+        assert sum(over) == pytest.approx(min(sums), abs=1e-9)
     # Of one abscissa there is no slope.
     assert lower_line([(5, 7), (5, 3)]) == lower_line([(5, 3)]) == (0.0, 3.0)
 

@@ -274,16 +274,16 @@ def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool, deci
     fed.run(2.6, under(0.0, -20.0))
     fed.load(0.0, -40.0)
     fed.run(6.0, under(0.0, -40.0 * share))
-    found = fed.watch.alarm
-    assert (found is not None) == alarm
-    if found is not None:
-        assert found.channel == 'dy'
-        assert found.shift == pytest.approx(-40.0 * (share - 1.0) * COMPLIANCE[1], rel=0.05)
+    alarmed = fed.watch.alarm
+    assert (alarmed is not None) == alarm
+    if alarmed is not None:
+        assert alarmed.channel == 'dy'
+        assert alarmed.shift == pytest.approx(-40.0 * (share - 1.0) * COMPLIANCE[1], rel=0.05)
         # Six of these are what is allowed: 5 um and 2 % of the movement.
-        assert found.sd == pytest.approx((5e-6 + 0.02 * abs(40.0 * share * COMPLIANCE[1])) / 6.0, rel=0.01)
+        assert alarmed.sd == pytest.approx((5e-6 + 0.02 * abs(40.0 * share * COMPLIANCE[1])) / 6.0, rel=0.01)
         # What the level under this load is does not end it, and it is not seen to end under another one.
         fed.run(20.0, under(0.0, -40.0 * share))
-        assert fed.watch.alarm is found
+        assert fed.watch.alarm is alarmed
         fed.load(0.0, 0.0)
         fed.run(20.0, under(0.0, 0.0))
         assert fed.watch.alarm is not None
@@ -320,15 +320,15 @@ def page(values: records.FloatArray, least: float) -> Expected:
     windows = values.reshape(-1, 25)
     means, scatters = windows.mean(axis=1), windows.std(axis=1)
     level, sums, began = float(np.median(means[3:7])), np.zeros(2), [0, 0]
-    since, first, quiet, out, counted = 0, 0, 0, None, list[float]()
+    since, first, quiet, out, used = 0, 0, 0, None, list[float]()
     for k in range(7, len(means)):
         usual = np.sort(scatters[max(0, k - 59) : k + 1])
         if scatters[k] > 3.0 * usual[len(usual) // 4]:
             continue
-        counted.append(means[k])
-        steps = np.abs(np.diff(counted))
-        wander = 1.4826 * np.median(steps) / 2**0.5 if len(steps) >= 4 else 0.0
-        sd = max(usual[len(usual) // 4] / 5.0, wander)
+        used.append(means[k])
+        steps = np.abs(np.diff(used))
+        between_sd = 1.4826 * np.median(steps) / 2**0.5 if len(steps) >= 4 else 0.0
+        sd = max(usual[len(usual) // 4] / 5.0, between_sd)
         off = (means[k] - level) / sd
         before, sums = sums, np.maximum(sums + np.clip(np.array([off, -off]) - max(2.0, least / sd), -8.0, 8.0), 0.0)
         began = [k if b == 0.0 < s else at for b, s, at in zip(before, sums, began, strict=True)]
@@ -347,11 +347,11 @@ def page(values: records.FloatArray, least: float) -> Expected:
     raise AssertionError('no alarm that ends')
 
 
-@pytest.mark.parametrize('wander', [0.0, 0.6e-6])
-def test_an_alarm_is_that_of_a_second_reckoning(wander: float) -> None:
+@pytest.mark.parametrize('shift', [0.0, 0.6e-6])
+def test_an_alarm_is_that_of_a_second_reckoning(shift: float) -> None:
     """psd_1 is moved across the base line, so that this stays as long, as soon as its level is known; then back.
 
-    With ``wander`` m all go from place to place, so that the windows' means differ by more than they scatter.
+    With ``shift`` m all go from place to place, so that the windows' means differ by more than they scatter.
     """
     fed, dots = Fed(), []
     fed.load(0.0, 0.0)
@@ -360,7 +360,7 @@ def test_an_alarm_is_that_of_a_second_reckoning(wander: float) -> None:
     def window(number: int) -> None:
         """All shake alike, now more, now less, so that what is usual is no wander from window to window."""
         size = {12: 8.2e-6, 20: 11e-6}.get(number, (2.0 + 0.5 * (3 * number % 7)) * 1e-6)
-        still = REST + moved * (7 <= number < 19) + wander * (number % 2)
+        still = REST + moved * (7 <= number < 19) + shift * (number % 2)
         dots.append(fed.run(0.5, lambda t: still + size * np.sin(12.0 * np.pi * t)[:, None]))
 
     for number in range(19):

@@ -152,10 +152,10 @@ def test_a_prefix_is_before_every_frame_once() -> None:
     for record in records:
         plain, prefixed = (to_messages(record, prefix) for prefix in ('', 'left_'))
         assert len(plain) == len(prefixed) > 0
-        for one, other in zip(plain, prefixed, strict=True):
-            frame = one.fields['header']['frame_id']
+        for first, other in zip(plain, prefixed, strict=True):
+            frame = first.fields['header']['frame_id']
             assert other.fields['header']['frame_id'] == (f'left_{frame}' if frame else '')
-            assert other.fields | {'header': None} == one.fields | {'header': None}
+            assert other.fields | {'header': None} == first.fields | {'header': None}
 
 
 @given(times, numbers, numbers, numbers)
@@ -274,15 +274,15 @@ KINDS = ['int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'float32', 'floa
 @pytest.mark.parametrize('kind', KINDS)
 def test_a_cloud_of_another_program_may_have_numbers_of_any_kind(kind: str) -> None:
     names = ['seq', 'dt', *CHANNELS]
-    own = np.dtype([(name, kind) for name in names])
-    points = np.zeros(2, own)
+    dtype = np.dtype([(name, kind) for name in names])
+    points = np.zeros(2, dtype)
     for i, name in enumerate(names):
         points[name] = [i, 10 + i]
     size = np.dtype(kind).itemsize
     number = 1 + KINDS.index(kind)
     fields = [{'name': name, 'offset': size * i, 'datatype': number, 'count': 1} for i, name in enumerate(names)]
     (m,) = to_messages(block(0))
-    cloud = {'fields': fields, 'point_step': own.itemsize, 'width': 2, 'data': points.tobytes()}
+    cloud = {'fields': fields, 'point_step': dtype.itemsize, 'width': 2, 'data': points.tobytes()}
     _, got = point_cloud2.to_points({**m.fields, **cloud})
     assert got.dtype['x1'] == np.dtype(kind)
     assert [tuple(row) for row in got.tolist()] == [tuple(range(8)), tuple(range(10, 18))]

@@ -263,9 +263,9 @@ def cloud(
     """PointCloud2 fields with any layout that has our eight names."""
     kinds = {'u4': 6, 'f4': 7, 'f8': 8, 'u2': 4}
     order = '>' if big else '<'
-    own = [formats.get(n, 'f4') for n in names]
-    offsets = [4 + sum(int(kind[1]) for kind in own[:i]) for i in range(len(names))]
-    ordered = [order + kind for kind in own]
+    types = [formats.get(n, 'f4') for n in names]
+    offsets = [4 + sum(int(kind[1]) for kind in types[:i]) for i in range(len(names))]
+    ordered = [order + kind for kind in types]
     dtype = np.dtype({'names': list(names), 'formats': ordered, 'offsets': offsets, 'itemsize': step})
     points = np.zeros(len(b.seq), dtype)
     points['seq'] = b.seq
@@ -278,7 +278,7 @@ def cloud(
         'header': {**message.fields['header'], 'frame_id': 'some_other_frame'},
         'fields': [
             {'name': n, 'offset': o, 'datatype': kinds[kind], 'count': 1}
-            for n, o, kind in zip(names, offsets, own, strict=True)
+            for n, o, kind in zip(names, offsets, types, strict=True)
         ],
         'is_bigendian': big,
         'point_step': step,
@@ -516,13 +516,13 @@ def test_another_rig_in_the_same_bag_is_reported(tmp_path: Path) -> None:
 
 
 def test_what_both_hold_is_compared(zeroed: Path, tmp_path: Path, capsys: Capsys) -> None:
-    kept = ('/psd/samples', '/link_tip/deflection', RIG)
+    topics = ('/psd/samples', '/link_tip/deflection', RIG)
 
     def edges(topic: str, since: int) -> bool:
         first = {'/psd/samples': 30, '/link_tip/deflection': 31}.get(topic, 0) * BLOCK_NS
-        return topic in kept and first <= since < 150 * BLOCK_NS
+        return topic in topics and first <= since < 150 * BLOCK_NS
 
-    bag = passed_on(zeroed, tmp_path / 'part', keep=lambda topic, _: topic in kept)
+    bag = passed_on(zeroed, tmp_path / 'part', keep=lambda topic, _: topic in topics)
     assert main(['replay', str(bag), '--compare']) == 0
     answer = capsys.readouterr().out
     assert 'the recording is partial: 0 messages are only in it' in answer
@@ -580,8 +580,8 @@ def test_of_several_rigs_one_is_chosen(zeroed: Path, tmp_path: Path, capsys: Cap
         recording = open_recording(two, namespace=given)
         assert rig_at_start(recording) == rigs(zeroed)[0]
     assert main(['replay', str(two), '--namespace', '/right', '--compare', '--strict']) == 0
-    left = open_recording(two, namespace='/left')
-    assert left.parameters == open_recording(CLEAN).parameters != recording.parameters
+    selected = open_recording(two, namespace='/left')
+    assert selected.parameters == open_recording(CLEAN).parameters != recording.parameters
     with pytest.raises(RecordingError, match='in the namespace /up'):
         next(open_recording(two, namespace='/up').blocks())
 

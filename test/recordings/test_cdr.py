@@ -86,8 +86,8 @@ def test_the_encoder_takes_every_kind_of_field() -> None:
     encoded = cdr.encoder_of(made_up)(values_of)
     decoded = store.deserialize_cdr(encoded, made_up.name)
     for name, value in values_of.items():
-        found = getattr(decoded, name)
-        assert (type(value)(found) if isinstance(value, bytes | list) else found) == value
+        decoded_value = getattr(decoded, name)
+        assert (type(value)(decoded_value) if isinstance(value, bytes | list) else decoded_value) == value
     assert bytes(store.serialize_cdr(decoded, made_up.name)) == encoded
     with pytest.raises(ValueError, match='2 values in an array of 3'):
         cdr.encoder_of(made_up)({**values_of, 'three': [1, 2]})
@@ -100,11 +100,11 @@ def test_a_type_that_is_not_ours_is_rejected() -> None:
 
 def test_constant_array_encodes_alike_at_any_offset() -> None:
     names = (('seq', 6), ('x', 7), ('y', 7))
-    others = [{'name': name, 'offset': 4 * i, 'datatype': kind, 'count': 1} for i, (name, kind) in enumerate(names)]
+    fields = [{'name': name, 'offset': 4 * i, 'datatype': kind, 'count': 1} for i, (name, kind) in enumerate(names)]
     size = {'height': 1, 'width': 0, 'point_step': 8, 'row_step': 0, 'data': b''}
-    kept = [Constant(others[:2]), Constant(others), Constant([])]
+    constants = [Constant(fields[:2]), Constant(fields), Constant([])]
     for frame in ('', 'a', 'ab', 'abc', 'abcd', 'abcde', 'tip', 'link_tip') * 2:
-        for constant in (*kept, kept[0], *kept):
+        for constant in (*constants, constants[0], *constants):
             header = {'stamp': {'sec': 1, 'nanosec': 2}, 'frame_id': frame}
             message = {'header': header, 'fields': constant, 'is_bigendian': False, 'is_dense': True, **size}
             plain = {**message, 'fields': list(constant)}

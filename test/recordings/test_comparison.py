@@ -25,9 +25,9 @@ ROOT = Path(__file__).parents[2]
 POSE = {'position': {'x': 1e-3, 'y': -2e-3, 'z': 0.0}, 'orientation': {'x': 0.0, 'y': 0.0, 'z': 1e-3, 'w': 1.0}}
 
 
-def changed(by: float, name: str = 'x') -> dict[str, dict[str, float]]:
-    """``POSE`` with one place changed by ``by`` m."""
-    return {**POSE, 'position': {**POSE['position'], name: POSE['position'][name] + by}}
+def changed(step: float, name: str = 'x') -> dict[str, dict[str, float]]:
+    """``POSE`` with one place changed by ``step`` m."""
+    return {**POSE, 'position': {**POSE['position'], name: POSE['position'][name] + step}}
 
 
 def test_numbers_agree_within_1e_9_of_largest() -> None:
@@ -82,9 +82,9 @@ def disturbed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     solve_many = ExactSolver.solve_many
 
     def disturbed_many(*given: Any) -> Solutions:
-        found = solve_many(*given)
-        found.pose[:, 0] *= 1.0 + share
-        return found
+        solutions = solve_many(*given)
+        solutions.pose[:, 0] *= 1.0 + share
+        return solutions
 
     monkeypatch.setattr(ExactSolver, 'solve_many', disturbed_many)
 
@@ -141,7 +141,7 @@ def test_versions_and_processor_are_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ('changes', 'found'),
+    ('changes', 'words'),
     [
         ({}, []),
         ({'numpy': '1.25.0'}, [f'numpy 1.25.0, now {np.__version__}']),
@@ -150,8 +150,8 @@ def test_versions_and_processor_are_there() -> None:
         ({'numpy': '\x1b[2J', 'mine': 'x' * 10_000}, [f'numpy \\x1b[2J, now {np.__version__}']),
     ],
 )
-def test_what_differs_is_named_with_both_values(changes: dict[str, str], found: list[str]) -> None:
-    assert differences({**provenance(), **changes}, provenance()) == found
+def test_what_differs_is_named_with_both_values(changes: dict[str, str], words: list[str]) -> None:
+    assert differences({**provenance(), **changes}, provenance()) == words
 
 
 def test_a_recording_that_does_not_say_is_of_another_version() -> None:

@@ -56,9 +56,9 @@ def test_a_plain_file_is_read(tmp_path: Path) -> None:
 
 
 def test_gaps_in_time_are_lost_samples(tmp_path: Path) -> None:
-    kept = [i for i in range(100) if i not in (3, 4, 40, 41, 42) and not 60 <= i < 80]
-    recording = open_recording(write(tmp_path / 'a.csv', *rows([f'{i / 1000:.3f}' for i in kept])))
-    assert recording.samples['seq'].tolist() == kept
+    present = [i for i in range(100) if i not in (3, 4, 40, 41, 42) and not 60 <= i < 80]
+    recording = open_recording(write(tmp_path / 'a.csv', *rows([f'{i / 1000:.3f}' for i in present])))
+    assert recording.samples['seq'].tolist() == present
     assert [b.index for b in recording.blocks()] == [0, 1, 2, 4]
 
 
@@ -68,10 +68,10 @@ def test_gaps_in_time_are_lost_samples(tmp_path: Path) -> None:
 def test_short_decimals_and_a_fast_clock_make_no_losses(tmp_path: Path, rate: float, decimals: int) -> None:
     if rate * 10**-decimals > 0.31:
         decimals = 5
-    kept = [i for i in range(20_000) if i % 997]
-    times = [f'{i * 1.0003 / rate:.{decimals}f}' for i in kept]
+    present = [i for i in range(20_000) if i % 997]
+    times = [f'{i * 1.0003 / rate:.{decimals}f}' for i in present]
     recording = open_recording(write(tmp_path / 'a.csv', *rows(times)))
-    assert (np.diff(recording.samples['seq'])).tolist() == np.diff(kept).tolist()
+    assert (np.diff(recording.samples['seq'])).tolist() == np.diff(present).tolist()
     assert recording.sample_rate_hz == pytest.approx(rate / 1.0003, rel=1e-3)
 
 
@@ -305,17 +305,17 @@ def reported(path: Path, lines: list[str], ending: str, last: str) -> tuple[list
     """(line, t_ns, cells) of each row before the error, and the error without its file."""
     path.write_bytes((ending.join(lines) + last).encode())
     table = SampleRows(path)
-    found = []
+    rows = []
     try:
         for lines_, t_ns, cells in table.rows():
             width = len(table.header)
-            found += [
+            rows += [
                 (line, t, [c.strip() for c in cells[i * width : (i + 1) * width]])
                 for i, (line, t) in enumerate(zip(lines_, t_ns, strict=True))
             ]
     except RecordingError as error:
-        return found, str(error).removeprefix(str(path))
-    return found, ''
+        return rows, str(error).removeprefix(str(path))
+    return rows, ''
 
 
 @pytest.fixture(scope='module')

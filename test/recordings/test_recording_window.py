@@ -85,10 +85,10 @@ def test_what_held_at_the_start_holds_from_there_on() -> None:
     start = 1_500_000_000
     assert [load.t_ns for load in part.loads()] == [start, 2_000_000_000]
     assert [(load.fx, load.fy) for load in part.loads()] == [(5.0, 0.0), (0.0, -8.0)]
-    first, *others = part.temperatures()
+    first, *later = part.temperatures()
     assert first.t_ns == start
     assert first.celsius == pytest.approx(21.125, abs=1e-3)
-    assert start < others[0].t_ns <= others[-1].t_ns < start + 1_000_000_000
+    assert start < later[0].t_ns <= later[-1].t_ns < start + 1_000_000_000
     assert len(part.references()) == 1000
     frame = part.to_pandas()
     assert list(frame['load_fx'].iloc[[0, 499, 500]]) == [5.0, 5.0, 0.0]
@@ -101,9 +101,9 @@ def test_parts_put_together_are_the_whole() -> None:
     np.testing.assert_array_equal(np.concatenate([part.samples['x1'] for part in parts]), full.samples['x1'])
     topic = '/link_tip/deflection'
     assert sum(len(part.estimates()[topic]) for part in parts) == len(full.estimates()[topic])
-    counted = [part.topics() for part in parts]
-    assert counted[1][topic] > 40
-    assert all(sum(one.get(name, 0) for one in counted) <= count for name, count in full.topics().items())
+    topics = [part.topics() for part in parts]
+    assert topics[1][topic] > 40
+    assert all(sum(counts.get(name, 0) for counts in topics) <= count for name, count in full.topics().items())
     inner = parts[1].crop(0.25, 0.5).with_block_size(10)
     assert isinstance(inner, RecordingWindow)
     assert len(inner.samples) == 250
@@ -236,8 +236,8 @@ def test_what_is_computed_from_a_part_says_which(two_files: tuple[Path, Path]) -
     full = psd_deflection.open(two_files[0])
     assert full.crop(0.5, 5.5).name == 'whole.csv, from 0.5 s to 5.5 s'
     assert full.crop(0.5, None).crop(1.0, None).name == 'whole.csv, from 0.5 s, from 1 s'
-    found = psd_deflection.calibrate(full.crop(0.5, 5.5), ROOT / 'config' / 'thesis_rig.yaml')
-    assert found.tree()['provenance']['recordings'][0]['name'] == 'whole.csv, from 0.5 s to 5.5 s'
+    calibration = psd_deflection.calibrate(full.crop(0.5, 5.5), ROOT / 'config' / 'thesis_rig.yaml')
+    assert calibration.tree()['provenance']['recordings'][0]['name'] == 'whole.csv, from 0.5 s to 5.5 s'
 
 
 @pytest.mark.parametrize('bag', ['clean', 'lost_samples', 'laser_off'])
@@ -248,19 +248,19 @@ def test_a_part_of_a_replay_is_what_it_is_in_the_whole(bag: str, tmp_path: Path,
     everything = json.loads(capsys.readouterr().out)
     words = ['--from', '1.013', '--to', '2.505']
     assert main(['replay', str(BAGS / bag), *words, '--out', str(part), '--json', '--compare', '--strict']) in (0, 1)
-    found = json.loads(capsys.readouterr().out)
-    assert found['compared']['different'] == found['compared']['rounded']
-    assert found['compared']['equal'] + found['compared']['rounded'] > 100
-    assert found['compared']['only_recorded'] == found['compared']['only_replayed'] == 0
+    tree = json.loads(capsys.readouterr().out)
+    assert tree['compared']['different'] == tree['compared']['rounded']
+    assert tree['compared']['equal'] + tree['compared']['rounded'] > 100
+    assert tree['compared']['only_recorded'] == tree['compared']['only_replayed'] == 0
     head, *rows = full.read_text().splitlines()
-    first, *others = part.read_text().splitlines()
+    first, *part_rows = part.read_text().splitlines()
     assert first == head
     start = int(next(psd_deflection.open(BAGS / bag).blocks()).t_ns[0])
     since = [int(row.partition(',')[0].replace('.', '')) - start for row in rows]
-    assert others == [row for row, t_ns in zip(rows, since, strict=True) if 1_013_000_000 <= t_ns < 2_505_000_000]
-    assert found['blocks'] == found['estimates'] + sum(found['rejected'].values())
-    assert sum(found['rejected'].values()) <= sum(everything['rejected'].values())
-    assert found['samples'] + found['lost'] == pytest.approx(1492, abs=40)
+    assert part_rows == [row for row, t_ns in zip(rows, since, strict=True) if 1_013_000_000 <= t_ns < 2_505_000_000]
+    assert tree['blocks'] == tree['estimates'] + sum(tree['rejected'].values())
+    assert sum(tree['rejected'].values()) <= sum(everything['rejected'].values())
+    assert tree['samples'] + tree['lost'] == pytest.approx(1492, abs=40)
 
 
 @pytest.mark.skipif(_many.FLEET is None, reason='an optional room')
@@ -356,8 +356,8 @@ def test_commands_list_cut_and_draw_them(marked: Path, tmp_path: Path, capsys: C
     assert '  marks            0.500 s  bump\n                   1.000 s  at rest\n' in capsys.readouterr().out
     words = [str(marked), '--from', 'mark:at rest', '--to', 'mark:bump']
     assert main(['info', *words, '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found['samples'], [mark['text'] for mark in found['marks']]) == (500, ['at rest'])
+    tree = json.loads(capsys.readouterr().out)
+    assert (tree['samples'], [mark['text'] for mark in tree['marks']]) == (500, ['at rest'])
     assert main(['plot', *words, '--json', '--out', str(tmp_path / 'x.html')]) == 0
     assert json.loads(capsys.readouterr().out)['samples'] == 500
     assert '"mark", "at rest"]' in (tmp_path / 'x.html').read_text()
@@ -570,7 +570,7 @@ def test_a_figure_draws_no_line_over_a_gap(drawing: str, bag: str) -> None:
     expected = list(zip(t[np.concatenate(([0], gaps + 1))], t[np.concatenate((gaps, [len(t) - 1]))], strict=True))
     assert len(expected) > 1 or (samples and bag == 'laser_off')
     for axes in figure.axes:
-        (line,) = [one for one in axes.lines if np.size(one.get_xdata()) > 2]
+        (line,) = [line for line in axes.lines if np.size(line.get_xdata()) > 2]
         drawn = _spans(np.asarray(line.get_xdata()), np.asarray(line.get_ydata()))
         # Of many points, those at the ends of a stretch may be thinned.
         assert len(drawn) == len(expected)

@@ -146,15 +146,15 @@ def test_recover_rejects_a_running_recording(tmp_path: Path) -> None:
     bag.close()
 
 
-@pytest.mark.parametrize('kept', [20_000, 3])
-def test_an_earlier_repair_is_not_overwritten(tmp_path: Path, kept: int) -> None:
+@pytest.mark.parametrize('size', [20_000, 3])
+def test_an_earlier_repair_is_not_overwritten(tmp_path: Path, size: int) -> None:
     folder = record(tmp_path / 'run', max_s=2.5)
-    cut(folder, 'run_1.mcap', kept)
+    cut(folder, 'run_1.mcap', size)
     (folder / 'run_1.mcap.cut').write_text('precious')
     with pytest.raises(RecordingError, match=r'run_1\.mcap\.cut: exists already'):
         recover(folder)
     assert (folder / 'run_1.mcap.cut').read_text() == 'precious'
-    assert (folder / 'run_1.mcap').stat().st_size == kept
+    assert (folder / 'run_1.mcap').stat().st_size == size
 
 
 @pytest.mark.parametrize(
@@ -205,8 +205,8 @@ def test_chunks_are_on_the_disk_within_half_a_second_of_log_time(tmp_path: Path)
                 continue
             # What a kill at this moment would leave.
             (tmp_path / 'left.mcap').write_bytes(bag.path.read_bytes())
-            left = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()]
-            assert int(block(i).t_ns[-1]) - left[-1] <= 520 * STEP
+            durable = [int(b.t_ns[-1]) for b in open_recording(tmp_path / 'left.mcap').blocks()]
+            assert int(block(i).t_ns[-1]) - durable[-1] <= 520 * STEP
 
 
 def test_the_lock_goes_with_the_writer(tmp_path: Path) -> None:
@@ -241,10 +241,10 @@ def test_recover_rewrites_a_metadata_yaml_that_does_not_match(
     # What describes it, and what rosbag2 compressed in its own way, stays.
     tree = yaml.safe_load(metadata.read_text())
     tree['rosbag2_bagfile_information'] |= {'compression_mode': 'message', 'relative_file_paths': ['run_0.mcap.zstd']}
-    for kept in (metadata.read_text(), yaml.safe_dump(tree)):
-        metadata.write_text(kept)
+    for valid in (metadata.read_text(), yaml.safe_dump(tree)):
+        metadata.write_text(valid)
         assert main(['recover', str(folder)]) == 0
-        assert metadata.read_text() == kept
+        assert metadata.read_text() == valid
 
 
 def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -457,7 +457,7 @@ def bytes_read() -> int:
 
 
 @contextlib.contextmanager
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Work]:
+def counting(monkeypatch: pytest.MonkeyPatch) -> Iterator[Work]:
     """Counts the work that is done inside."""
     work = Work()
     decompress = mcap_reader._decompress
@@ -483,7 +483,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Work]:
 
 def test_a_small_file_causes_little_work(crafted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     size = crafted.stat().st_size
-    with counted(monkeypatch) as work:
+    with counting(monkeypatch) as work:
         recording = BagRecording(crafted)
         recording.topics()
         with pytest.raises(RecordingError, match='no samples'):
@@ -527,7 +527,7 @@ def test_a_tail_of_zeros_is_a_cut(tmp_path: Path, tail: int, monkeypatch: pytest
     assert ends is not None
     path.write_bytes(full[:ends])
     os.truncate(path, ends + tail)
-    with counted(monkeypatch) as work:
+    with counting(monkeypatch) as work:
         recording = BagRecording(path)
         assert [b.index for b in recording.blocks()] == before
     assert f'ends at byte {ends} before its end' in recording.warnings[0]

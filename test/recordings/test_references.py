@@ -31,26 +31,26 @@ def test_frames_without_an_answer_are_counted_not_read(tmp_path: Path) -> None:
         '\n'
         '0.1,,,,,,,blurred\n',
     )
-    found = read_references(path)
-    assert found.t_ns.tolist() == [100_000, 33_400_000]
-    assert found.poses.tolist() == [[0.0, 0.0, 0.0], [1e-3, 2e-3, 0.01]]
-    assert found.sd is not None
-    assert found.sd[1].tolist() == [1e-5, 2e-5, 1e-4]
-    assert found.rejected == {'blurred': 2}
+    references = read_references(path)
+    assert references.t_ns.tolist() == [100_000, 33_400_000]
+    assert references.poses.tolist() == [[0.0, 0.0, 0.0], [1e-3, 2e-3, 0.01]]
+    assert references.sd is not None
+    assert references.sd[1].tolist() == [1e-5, 2e-5, 1e-4]
+    assert references.rejected == {'blurred': 2}
 
 
 def test_a_stage_needs_four_columns_only(tmp_path: Path) -> None:
-    found = read_references(written(tmp_path, 'theta,t,dx,dy\n0.5,1,2,3\n'))
-    assert found.poses.tolist() == [[2.0, 3.0, 0.5]]
-    assert found.sd is None
+    references = read_references(written(tmp_path, 'theta,t,dx,dy\n0.5,1,2,3\n'))
+    assert references.poses.tolist() == [[2.0, 3.0, 0.5]]
+    assert references.sd is None
 
 
 def test_a_csv_recording_has_its_own(tmp_path: Path) -> None:
     rows = ['t,x1,y1,sum1,x2,y2,sum2,ref_dx,ref_dy,ref_theta']
     rows += [f'{i * 1e-3:.3f},0,0,5,0,0,5,' + ('1e-3,0,0' if i % 20 == 0 else ',,') for i in range(100)]
-    found = read_references(written(tmp_path, '\n'.join(rows) + '\n'))
-    assert np.allclose(found.t_ns, np.arange(0, 100, 20) * 1e6)
-    assert found.poses[:, 0].tolist() == [1e-3] * 5
+    references = read_references(written(tmp_path, '\n'.join(rows) + '\n'))
+    assert np.allclose(references.t_ns, np.arange(0, 100, 20) * 1e6)
+    assert references.poses[:, 0].tolist() == [1e-3] * 5
 
 
 @pytest.mark.parametrize(
@@ -85,8 +85,8 @@ def test_no_file(tmp_path: Path) -> None:
 
 def test_a_bag_states_the_deviations_of_each_reference(tmp_path: Path) -> None:
     write_bag(tmp_path / 'bag', {})
-    found = references_in(open_recording(tmp_path / 'bag'))
-    assert found is not None
-    assert len(found.t_ns) == len(found.poses) >= 2
-    assert found.sd is not None
-    assert found.sd == pytest.approx(np.full((len(found.t_ns), 3), 1e-6))
+    references = references_in(open_recording(tmp_path / 'bag'))
+    assert references is not None
+    assert len(references.t_ns) == len(references.poses) >= 2
+    assert references.sd is not None
+    assert references.sd == pytest.approx(np.full((len(references.t_ns), 3), 1e-6))

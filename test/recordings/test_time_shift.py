@@ -42,10 +42,10 @@ def shift_of(table: FloatArray, rows: int, axes: IntArray = ROTATED, stated: flo
 
 @pytest.mark.parametrize('rows', [0, 1, 8, 40, 1000, 3000, -1, -8, -40, -1000, -3000])
 def test_the_shift_is_found_of_either_sign(rows: int) -> None:
-    found = shift_of(volts(STEPS), rows)
-    assert not found.unknown
-    assert abs(found.seconds - 1e-3 * rows) < 3.0 * found.sd < 1e-4
-    assert (found.evidence > 0.0) == (rows != 0)
+    shift = shift_of(volts(STEPS), rows)
+    assert not shift.unknown
+    assert abs(shift.seconds - 1e-3 * rows) < 3.0 * shift.sd < 1e-4
+    assert (shift.evidence > 0.0) == (rows != 0)
     assert shift_of(volts(STEPS), rows, stated=1e-3 * rows).evidence == 0.0
 
 
@@ -55,9 +55,9 @@ def test_lost_samples_and_spikes_leave_the_shift() -> None:
     table[rng.random(len(table)) < 0.1] = np.nan
     table[6000:7000, 3:] = np.nan
     table[rng.integers(0, len(table), 10), 4] = 9.0
-    found = shift_of(table, -40)
-    assert found.evidence > 0.0
-    assert abs(found.seconds + 0.04) < 3.0 * found.sd
+    shift = shift_of(table, -40)
+    assert shift.evidence > 0.0
+    assert abs(shift.seconds + 0.04) < 3.0 * shift.sd
 
 
 @pytest.mark.parametrize(
@@ -103,12 +103,12 @@ def test_each_joined_sample_is_a_reading_of_both(tmp_path: Path, every: int, off
     clock = joined.offset
     assert abs(clock.seconds - offset - rate * clock.at) < 4.0 * clock.sd < 2e-3
     assert clock.rate == rate == 0.0 or abs(clock.rate - rate) < 4.0 * clock.rate_sd < 1e-4
-    found = joined.recording.samples
-    assert len(found) == pytest.approx((len(volts(*PUSHES)) - 1730) / max(every, 10), abs=joined.lost + 2)
-    assert joined.lost < 0.01 * len(found)
+    samples = joined.recording.samples
+    assert len(samples) == pytest.approx((len(volts(*PUSHES)) - 1730) / max(every, 10), abs=joined.lost + 2)
+    assert joined.lost < 0.01 * len(samples)
     for table, names in zip(tables, (['x1', 'y1', 'sum1'], ['x2', 'y2', 'sum2']), strict=True):
         rows = {tuple(row) for b in CsvRecording(table, part=True).blocks() for row in b.volts.tolist()}
-        assert {tuple(row) for row in found[names].tolist()} <= rows
+        assert {tuple(row) for row in samples[names].tolist()} <= rows
 
 
 @pytest.mark.parametrize('ppm', [0, 40, 100, -200])

@@ -227,8 +227,8 @@ def test_effects_are_put_into_the_users_file(tmp_path: Path) -> None:
     path.write_text(USERS_FILE)
     rotation = {'name': 'sensor_rotation', 'psd': 2, 'angle': 0.01}
     out = with_effects_section(USERS_FILE, {'sensor_rotation_2': rotation}, path)
-    for kept in ('# Our rig in the cellar.', '# measured', '# drilled 2024-03-01', '# The port follows.', 'rate: 010'):
-        assert kept in out
+    for line in ('# Our rig in the cellar.', '# measured', '# drilled 2024-03-01', '# The port follows.', 'rate: 010'):
+        assert line in out
     assert 'link: {length: 0.8, youngs_modulus: 69e9}' in out
     assert "axes: ['y', x]" in out
     assert 'creep' not in out

@@ -22,7 +22,7 @@ WIRINGS = [Wiring(exchanged, axes) for exchanged in (False, True) for axes in it
 
 
 def values_of(wiring: Wiring) -> dict[str, object]:
-    axes: dict[str, object] = {f'psd_{number}.axes': list(own) for number, own in enumerate(wiring.axes, start=1)}
+    axes: dict[str, object] = {f'psd_{number}.axes': list(axes) for number, axes in enumerate(wiring.axes, start=1)}
     return {'psds_exchanged': wiring.exchanged, **axes}
 
 

@@ -72,9 +72,9 @@ def launch(domain: int) -> Iterator[Callable[..., Program]]:
         return started[-1]
 
     yield begin
-    for one in started:
-        one.end(signal.SIGTERM)
-        print(*one.lines[-50:], sep='\n')
+    for child in started:
+        child.end(signal.SIGTERM)
+        print(*child.lines[-50:], sep='\n')
 
 
 @pytest.fixture
@@ -132,13 +132,13 @@ class Peer:
 
     def until_sent(self, send: Callable[[], object], condition: Callable[[], bool], what: str) -> None:
         """Until ``condition``; ``send`` is called at once and each ``SEND_AGAIN_S``."""
-        due = -math.inf
+        next_time = -math.inf
 
         def sent() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
+            nonlocal next_time
+            if time.monotonic() >= next_time:
                 send()
-                due = time.monotonic() + SEND_AGAIN_S
+                next_time = time.monotonic() + SEND_AGAIN_S
             return condition()
 
         self.until(sent, what)
@@ -183,8 +183,8 @@ class Peer:
 
 @pytest.fixture
 def peer(domain: int) -> Iterator[Peer]:
-    with contextlib.closing(Peer()) as one:
-        yield one
+    with contextlib.closing(Peer()) as made:
+        yield made
 
 
 @pytest.fixture(scope='session')

@@ -60,8 +60,8 @@ def main() -> None:
     heard.wait()
     signal.setitimer(signal.ITIMER_REAL, PERIOD_S, PERIOD_S)
     for number in range(10**6):
-        own = [*number.to_bytes(4, 'little'), *([0] * 12)]
-        writer.write(Half(own, 0) if half else Goal(own, 0, 0, list(b'\xff\xfe\0'), [0] * 4, [0], [0] * 8))
+        goal_id = [*number.to_bytes(4, 'little'), *([0] * 12)]
+        writer.write(Half(goal_id, 0) if half else Goal(goal_id, 0, 0, list(b'\xff\xfe\0'), [0] * 4, [0], [0] * 8))
         print('sent', number, flush=True)
         signal.sigwait({signal.SIGALRM})
 

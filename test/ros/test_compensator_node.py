@@ -134,8 +134,8 @@ def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Prog
     assert peer.set('/compensator', 'max_rate', 1e-4).successful
     asked = len(plant.offsets)
     assert not peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
-    left = re.compile(r'an offset of \S+ at \w+ is left after 10 s')
-    peer.until(lambda: left.search(compensator.text) is not None, 'what is left')
+    remains = re.compile(r'an offset of \S+ at \w+ is left after 10 s')
+    peer.until(lambda: remains.search(compensator.text) is not None, 'what is left')
     # It goes on meanwhile, and the next attempt waits anew.
     assert 0.0 < np.abs(plant.offsets[-1]).max() < np.abs(plant.offsets[asked]).max()
     assert peer.set('/compensator', 'max_rate', 0.1).successful
@@ -205,7 +205,7 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
         'old': 's old',
     }
     topics = {'/end_effector/deflection': poses, '/joint_states': joints}
-    return {name: (m, topic, reported[name]) for topic, some in topics.items() for name, m in some.items()}
+    return {name: (m, topic, reported[name]) for topic, by_name in topics.items() for name, m in by_name.items()}
 
 
 @pytest.mark.slow
@@ -216,18 +216,18 @@ def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program,
     senders = {topic: peer.node.create_publisher(kind, topic, 5) for topic, kind in kinds.items()}
     peer.until(lambda: all(s.get_subscription_count() for s in senders.values()), 'that it listens')
 
-    def counted(topic: str) -> int:
+    def rejections(topic: str) -> int:
         values = {v.key: v.value for s in states[-1].status for v in s.values} if states else {}
         return int(values.get(f'messages rejected: {topic.strip("/")}', '0'))
 
     def rejected(topic: str, why: str) -> Callable[[], bool]:
-        wanted, before = compensator.text.count(why), counted(topic)
-        return lambda: compensator.text.count(why) > wanted or (before >= 3 and counted(topic) > before)
+        wanted, before = compensator.text.count(why), rejections(topic)
+        return lambda: compensator.text.count(why) > wanted or (before >= 3 and rejections(topic) > before)
 
     for name, (message, topic, why) in strange_messages().items():
         send = partial(senders[topic].publish, message)
         peer.until_sent(send, rejected(topic, why), f'the rejection of what is {name}')
-    peer.until(lambda: counted('/end_effector/deflection') >= 4 and counted('/joint_states') >= 5, 'their counts')
+    peer.until(lambda: rejections('/end_effector/deflection') >= 4 and rejections('/joint_states') >= 5, 'their counts')
     assert compensator.process.poll() is None
     assert plant.step() <= WITHIN
 

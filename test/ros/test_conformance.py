@@ -76,7 +76,7 @@ class Profile:
 
     published: tuple[type, str]
     fixed: tuple[str, object]
-    beyond: tuple[str, object]
+    out_of_range: tuple[str, object]
     rejected: Mapping[str, Sent | str]
     live: tuple[str, object] | str
     frames: Callable[[Running], bool] | str
@@ -113,8 +113,8 @@ class Running:
 
     def described(self) -> list[Any]:
         names = self.call(ListParameters, 'list_parameters', ListParameters.Request()).result.names
-        own = [name for name in names if not name.startswith(ROS_OWN)]
-        request = DescribeParameters.Request(names=own)
+        selected = [name for name in names if not name.startswith(ROS_OWN)]
+        request = DescribeParameters.Request(names=selected)
         return list(self.call(DescribeParameters, 'describe_parameters', request).descriptors)
 
     def state(self) -> int:
@@ -139,8 +139,8 @@ class Running:
 
     def rejections(self) -> int:
         """As its diagnostics count them."""
-        own = f'{NAMESPACE}/{self.name}'.removeprefix('/')
-        last = {s.name: s for report in self.reports for s in report.status if s.name.startswith(own)}
+        prefix = f'{NAMESPACE}/{self.name}'.removeprefix('/')
+        last = {s.name: s for report in self.reports for s in report.status if s.name.startswith(prefix)}
         counts = (v.value for s in last.values() for v in s.values if 's rejected' in v.key)
         return sum(int(count) for count in counts)
 
@@ -283,7 +283,7 @@ PROFILES: Mapping[str, Profile] = {
         fixed=('link.length', 0.4),
         live=('sum_min', 2.25),
         used=sum_min_acts,
-        beyond=('amplifier.noise', -1.0),
+        out_of_range=('amplifier.noise', -1.0),
         rejected=loads_at('link_tip/load'),
         frames=frame_of(PoseStamped, 'link_tip/deflection', 'left_link_tip_rest'),
         sim_time='rejected',
@@ -294,7 +294,7 @@ PROFILES: Mapping[str, Profile] = {
         fixed=('frame_prefix', 'right_'),
         live=('camera.exposure', 0.5),
         used=exposure_acts,
-        beyond=('target.radius', -1.0),
+        out_of_range=('target.radius', -1.0),
         rejected={
             'nan': (CameraInfo, 'camera_info', CameraInfo(k=[math.nan] * 9)),
             'huge': (CameraInfo, 'camera_info', CameraInfo(k=[1e300] * 9)),
@@ -310,7 +310,7 @@ PROFILES: Mapping[str, Profile] = {
         published=(PoseWithCovarianceStamped, 'end_effector/deflection'),
         fixed=('base_frame', 'stand'),
         live='all its parameters are read at the start',
-        beyond=('slopes', 'none'),
+        out_of_range=('slopes', 'none'),
         rejected=loads_at('upper/link_tip/load'),
         frames=frame_of(PoseWithCovarianceStamped, 'end_effector/deflection', 'left_end_effector_rest'),
         sim_time='rejected',
@@ -322,7 +322,7 @@ PROFILES: Mapping[str, Profile] = {
         fixed=('drive', True),
         live=('stale', 10.0),
         used=age_acts,
-        beyond=('max_rate', -1.0),
+        out_of_range=('max_rate', -1.0),
         rejected={
             'nan': (JointState, 'joint_states', JointState(name=['shoulder'], position=[math.nan])),
             'huge': (JointState, 'joint_states', JointState(name=['elbow'], position=[1e300])),
@@ -339,7 +339,7 @@ PROFILES: Mapping[str, Profile] = {
         fixed=('shaper', 'zv'),
         live=('lead', 0.9),
         used=lead_acts,
-        beyond=('max_step', -1.0),
+        out_of_range=('max_step', -1.0),
         rejected={
             'nan': (JointTrajectory, 'shaper/trajectory', trajectory(math.nan)),
             'huge': (JointTrajectory, 'shaper/trajectory', trajectory(1e300)),
@@ -354,8 +354,8 @@ PROFILES: Mapping[str, Profile] = {
 
 @pytest.fixture(scope='module')
 def complete_peer(domain: int) -> Iterator[Peer]:
-    with contextlib.closing(Peer()) as one:
-        yield one
+    with contextlib.closing(Peer()) as made:
+        yield made
 
 
 @pytest.fixture(scope='module', params=nodes_of_setup())
@@ -374,9 +374,9 @@ def node_of_module(
         return started[-1]
 
     yield alive
-    for one in started:
-        one.program.end()
-        print(*one.program.lines[-30:], sep='\n')
+    for node in started:
+        node.program.end()
+        print(*node.program.lines[-30:], sep='\n')
 
 
 @pytest.fixture
@@ -394,11 +394,11 @@ def rejects(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
             # Without it every trajectory is rejected.
             running.send((JointState, 'joint_states', JointState(name=['joint_0'], position=[0.5])))
 
-    def counted() -> bool:
+    def is_counted() -> bool:
         why = running.texts(reports)
         return running.rejections() > before and any(word in why for word in words)
 
-    running.peer.until_sent(send, counted, f'the rejection of {sent[1]} for one of {words}')
+    running.peer.until_sent(send, is_counted, f'the rejection of {sent[1]} for one of {words}')
     return running.program.process.poll() is None
 
 
@@ -423,7 +423,7 @@ def test_parameter_file_is_read(running: Running) -> None:
 @pytest.mark.parametrize('name', nodes_of_setup())
 @pytest.mark.parametrize('why', ['unknown', pytest.param('out of bounds', marks=pytest.mark.slow)])
 def test_invalid_parameter_ends_the_start(name: str, why: str, domain: int, tmp_path: Path) -> None:
-    parameter, value = PROFILES[name].beyond if why == 'out of bounds' else ('max_ofset', 0.5)
+    parameter, value = PROFILES[name].out_of_range if why == 'out of bounds' else ('max_ofset', 0.5)
     command = [*PSD_DEFLECTION, name, *PROFILES[name].words, '--ros-args', '-p', f'{parameter}:={value}']
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr
@@ -438,7 +438,7 @@ def test_unknown_parameter_cannot_be_set(running: Running) -> None:
 
 
 def test_value_out_of_bounds_cannot_be_set(running: Running) -> None:
-    name, value = running.profile.beyond
+    name, value = running.profile.out_of_range
     before = running.get(name)
     answer = running.set(name, value)
     assert not answer.successful
@@ -483,8 +483,8 @@ def test_log_is_on_rosout(running: Running) -> None:
 
 def test_diagnostics_are_named_after_the_node(running: Running) -> None:
     names = {status.name for report in running.reports for status in report.status}
-    own = f'left/{running.name}'
-    assert [name for name in names if not name.startswith((f'{own}: ', f'{own}/'))] == []
+    prefix = f'left/{running.name}'
+    assert [name for name in names if not name.startswith((f'{prefix}: ', f'{prefix}/'))] == []
 
 
 def test_namespace_holds_its_topics(running: Running) -> None:
@@ -569,13 +569,13 @@ def test_its_topics_are_rows_of_the_table(running: Running) -> None:
     """On the graph there is nothing else, with these types; what rclpy makes itself is in no table."""
     node = running.peer.node
     of_rclpy = ('/parameter_events', '/clock', f'/{running.name}/transition_event')
-    own = (node.get_publisher_names_and_types_by_node, lambda row: (row,), PUBLISHED)
-    others = (node.get_subscriber_names_and_types_by_node, lambda rows: rows, HEARD)
-    for graph, rows_of, table in (own, others):
+    publishers = (node.get_publisher_names_and_types_by_node, lambda row: (row,), PUBLISHED)
+    subscriptions = (node.get_subscriber_names_and_types_by_node, lambda rows: rows, HEARD)
+    for graph, rows_of, table in (publishers, subscriptions):
         rows = {row.name.replace('~', f'/{running.name}'): row for entry in table.values() for row in rows_of(entry)}
-        found = dict(graph(running.name, NAMESPACE))
-        assert found or graph is others[0]
-        for topic, kinds in found.items():
+        topics = dict(graph(running.name, NAMESPACE))
+        assert topics or graph is subscriptions[0]
+        for topic, kinds in topics.items():
             # Those of a chain's links lie below the link's name.
             name = re.sub('^/(upper|fore)(?=/)', '', topic.removeprefix(NAMESPACE))
             if name in of_rclpy or topic in of_rclpy or '/_action/' in topic:
@@ -599,10 +599,10 @@ def served(running: Running) -> dict[str, list[str]]:
 def test_its_actions_are_rows_of_the_table(running: Running) -> None:
     rows, node = served(running), running.peer.node
 
-    def found() -> bool:
+    def served_only() -> bool:
         return dict(get_action_server_names_and_types_by_node(node, running.name, NAMESPACE)) == rows
 
-    running.peer.until(found, f'{rows} and no other action')
+    running.peer.until(served_only, f'{rows} and no other action')
 
 
 def test_goal_that_cannot_be_used_is_rejected(running: Running) -> None:
@@ -623,13 +623,13 @@ def test_goal_that_cannot_be_used_is_rejected(running: Running) -> None:
         for why, sent in strange.items():
             before, reports = running.rejections(), len(running.reports)
 
-            def counted(before: int = before, reports: int = reports, why: str = why) -> bool:
+            def is_counted(before: int = before, reports: int = reports, why: str = why) -> bool:
                 return running.rejections() > before and why in running.texts(reports)
 
             future = client.send_goal_async(sent)
             running.peer.until(future.done, 'the answer to a goal')
             assert not future.result().accepted
-            running.peer.until(counted, f'the rejection of a goal: {why}')
+            running.peer.until(is_counted, f'the rejection of a goal: {why}')
     finally:
         client.destroy()
 

@@ -163,15 +163,15 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     store = get_typestore(Stores.ROS2_JAZZY)
     received = {stamp(p): p.pose.position.x for p in poses}
     with Reader(folder) as bag:
-        found = {
+        recorded = {
             stamp(m): m.pose.position.x
             for c, _, raw in bag.messages()
             if c.topic == '/link_tip/deflection'
             for m in [store.deserialize_cdr(raw, c.msgtype)]
         }
-    assert len(found) >= 50
-    assert all(found[t] == received[t] for t in found if t in received)
-    assert len(set(found) & set(received)) >= 50
+    assert len(recorded) >= 50
+    assert all(recorded[t] == received[t] for t in recorded if t in received)
+    assert len(set(recorded) & set(received)) >= 50
 
 
 @pytest.mark.slow
@@ -220,16 +220,16 @@ def test_raw_samples_as_plain_numbers_in_prefixed_frames(start: Callable[..., An
     assert frames == {'left_link_tip_rest', 'left_link_tip', 'left_psd_1', 'left_psd_2', 'left_link_base'}
     rows = {stamp(c) + int(p['dt']): p for c in clouds for p in points_of(c)}
     for number, heard in enumerate(volts, 1):
-        found = [(m.vector, rows[stamp(m)]) for m in heard if stamp(m) in rows]
-        assert len(found) >= 200
-        for vector, row in found:
+        pairs = [(m.vector, rows[stamp(m)]) for m in heard if stamp(m) in rows]
+        assert len(pairs) >= 200
+        for vector, row in pairs:
             assert (vector.x, vector.y, vector.z) == tuple(row[f'{c}{number}'] for c in ('x', 'y', 'sum'))
     assert daemon.end() == 0, daemon.lines
     (folder,) = tmp_path.glob('psd_*')
     with Reader(folder) as bag:
-        kept = {c.topic for c in bag.connections}
-        assert not kept & {'/psd_1/volts', '/psd_2/volts'}
-        assert '/psd/samples' in kept
+        topics = {c.topic for c in bag.connections}
+        assert not topics & {'/psd_1/volts', '/psd_2/volts'}
+        assert '/psd/samples' in topics
     recording = open_recording(folder)
     assert recording.node == '/estimator'
     assert main(['replay', str(folder), '--compare', '--strict']) == 0

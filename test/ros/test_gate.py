@@ -60,10 +60,10 @@ def heard_as(monkeypatch: pytest.MonkeyPatch, delivery: Delivery = KEPT, most_by
 @pytest.fixture
 def gated(peer: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gated]:
     heard_as(monkeypatch)
-    one = Gated(peer)
-    yield one
-    peer.executor.remove_node(one.node)
-    one.node.destroy_node()
+    made = Gated(peer)
+    yield made
+    peer.executor.remove_node(made.node)
+    made.node.destroy_node()
 
 
 def sender(peer: Any, delivery: Any = 50) -> Any:

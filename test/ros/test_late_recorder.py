@@ -56,8 +56,8 @@ def recorded_late(peer: Any, poses: list[Any], folder: Path) -> Path:
     peer.until(lambda: memories() > before, 'the next memory')
     observed = len(poses)
     peer.until(lambda: len(poses) >= observed + 100, 'two seconds after it')
-    for one in listening:
-        peer.node.destroy_subscription(one)
+    for subscription in listening:
+        peer.node.destroy_subscription(subscription)
     return written(folder / f'late_{len(list(folder.iterdir()))}', heard)
 
 
@@ -106,12 +106,12 @@ def test_velocity_and_filtered_pose_replay_bit_for_bit(
     turning = peer.node.create_publisher(AccelStamped, '/link_base/acceleration', 10)
     peer.until(lambda: turning.get_subscription_count() > 0, 'the subscription')
 
-    def counted(key: str) -> int:
+    def count_of(key: str) -> int:
         (status,) = [s for s in health[-1].status if s.name == 'estimator: motion'] if health else [None]
         return int({v.key: v.value for v in status.values}[key]) if status is not None else 0
 
     now, reported = len(speeds), 0
-    while counted('base accelerations') < 10 or counted('base accelerations, rejected') < 2 or len(speeds) < now + 50:
+    while count_of('base accelerations') < 10 or count_of('base accelerations, rejected') < 2 or len(speeds) < now + 50:
         base = AccelStamped()
         base.header.stamp = peer.node.get_clock().now().to_msg()
         base.header.frame_id = 'link_base' if reported % 10 else 'tool0'

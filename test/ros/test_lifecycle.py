@@ -144,10 +144,10 @@ def test_parameters_set_unconfigured_are_kept(
     assert put(peer, effects__axis_crosstalk__xy=0.02) == ''
     rigs = peer.collect(String, '/link_tip/rig', LATCHED)
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
-    own = peer.collect(PoseStamped, '/link_tip/ols/deflection')
+    of_ols = peer.collect(PoseStamped, '/link_tip/ols/deflection')
     markers = peer.collect(MarkerArray, '/link_tip/markers')
     cycle(peer, 'configure', 'activate')
-    peer.until(lambda: len(poses) >= 30 and len(own) >= 30 and len(markers) > 0 and rigs != [], 'estimates of ols')
+    peer.until(lambda: len(poses) >= 30 and len(of_ols) >= 30 and len(markers) > 0 and rigs != [], 'estimates of ols')
     reported = json.loads(rigs[-1].data)['parameters']
     assert [reported[n] for n in ('block_size', 'sum_min', 'effects.axis_crosstalk.xy')] == [10, 2.4, 0.02]
     assert value_of(peer, 'solvers')[0] == 'ols'

@@ -39,9 +39,9 @@ URDF = ROOT / 'config' / 'two_links.urdf'
 
 @pytest.fixture
 def node(launch: Callable[..., Program]) -> Iterator[Program]:
-    one = launch('shaper', *ZVD)
-    yield one
-    assert one.end() == 0
+    program = launch('shaper', *ZVD)
+    yield program
+    assert program.end() == 0
 
 
 def message(*points: JointTrajectoryPoint, names: tuple[str, ...] = NAMES) -> JointTrajectory:
@@ -164,8 +164,8 @@ def test_settings_are_parameters(node: Program, peer: Any) -> None:
     given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
     reported(peer, shoulder=0.0, elbow=0.02)
-    far = message(point(0.0, [0.0, 0.0]))
-    peer.until(lambda: given.publish(far) or 'from where elbow is' in node.text, 'a rejection')
+    distant = message(point(0.0, [0.0, 0.0]))
+    peer.until(lambda: given.publish(distant) or 'from where elbow is' in node.text, 'a rejection')
     assert 'must be at most 0.01' in node.text
 
 
@@ -308,10 +308,10 @@ def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Begin) -> N
     assert (old.status, old.result.error_code) == (ABORTED, -1)
     assert 'preempted' in old.result.error_string
     assert arm.controller is not None
-    (t0, one), (t1, two) = (arriving(goal.trajectory, JOINTS) for goal in arm.controller.goals)
+    (t0, replaced), (t1, latest) = (arriving(goal.trajectory, JOINTS) for goal in arm.controller.goals)
     # It begins where the one before it is then, and as fast.
-    here = one.at(np.array([t1 - t0]))[0]
-    np.testing.assert_allclose(two.states[0, :2], here, atol=1e-5)
+    here = replaced.at(np.array([t1 - t0]))[0]
+    np.testing.assert_allclose(latest.states[0, :2], here, atol=1e-5)
 
 
 @pytest.mark.slow

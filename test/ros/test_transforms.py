@@ -74,9 +74,9 @@ def test_a_third_psd_has_its_frame_and_its_topics() -> None:
 
 def test_psds_at_the_base_do_not_move_with_the_tip() -> None:
     changed = {'solver': 'base_pair', 'solvers': ['base_pair'], 'psd_1.height': -0.5, 'psd_2.height': -0.585}
-    found = tree(load_rig(overrides=changed))
-    assert found['psd_1'] == ('link_tip_rest', (0.0, 0.070, -0.5))
-    assert found['psd_2'][0] == 'link_tip_rest'
+    frames = tree(load_rig(overrides=changed))
+    assert frames['psd_1'] == ('link_tip_rest', (0.0, 0.070, -0.5))
+    assert frames['psd_2'][0] == 'link_tip_rest'
 
 
 class Node:
@@ -193,8 +193,8 @@ def test_plate_follows_estimate_and_dot_stays_on_beam() -> None:
     tip = now['link', 0].points[-1]
     assert (tip.x, tip.y, tip.z) == pytest.approx((dx, dy, RIG.link.length))
     assert now['psd', 1].pose.orientation.z == pytest.approx(math.sin(theta / 2))
-    far = by_name(moving(RIG, bent, spots((0.0, 0.0, 0.0, 0.0)), 10.0))
-    assert far['link', 0].points[-1].y == pytest.approx(10.0 * dy)
+    scaled = by_name(moving(RIG, bent, spots((0.0, 0.0, 0.0, 0.0)), 10.0))
+    assert scaled['link', 0].points[-1].y == pytest.approx(10.0 * dy)
 
 
 def test_a_lost_dot_is_taken_away() -> None:

@@ -212,7 +212,7 @@ def read_rest(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
             heard.extend(piece)
             return piece
 
-    def port(name: str, baud: int, **others: object) -> SerialPort:
+    def port(name: str, baud: int, **settings: object) -> SerialPort:
         return Listener(name, baud)
 
     monkeypatch.setattr(port_source, 'open_port', port)
@@ -489,8 +489,8 @@ class Asked(MadeUp):
 def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
     """After the source has ended."""
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
-    own = {'monotonic': lambda: source.now_ns / 1e9, 'monotonic_ns': lambda: source.now_ns}
-    monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), **own}))
+    clock = {'monotonic': lambda: source.now_ns / 1e9, 'monotonic_ns': lambda: source.now_ns}
+    monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), **clock}))
     acquisition = Acquisition(load_rig(), null_log)
     acquisition.open()
     acquisition.start()

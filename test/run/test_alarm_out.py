@@ -95,10 +95,10 @@ def forwarded(command: str = '', webhook: str = '', times: int = 1) -> tuple[Ala
 
 
 def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Server) -> None:
-    kept = tmp_path / 'it is; $(kept)'
-    out, stated = forwarded(python(KEEP, str(kept)), server.url)
+    output = tmp_path / 'it is; $(kept)'
+    out, stated = forwarded(python(KEEP, str(output)), server.url)
     expected = finding(ALARM, {'device': 'abc'})
-    assert json.loads(kept.read_text()) == expected
+    assert json.loads(output.read_text()) == expected
     assert [json.loads(body) for body in server.got] == [expected]
     assert stated == []
     assert (out.sent, out.failed) == (2, 0)
@@ -110,8 +110,8 @@ def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Se
 
 
 def test_no_shell_reads_the_command(tmp_path: Path) -> None:
-    kept = tmp_path / 'kept'
-    forwarded(python(KEEP, str(kept)) + f' ; touch {tmp_path}/made $(touch {tmp_path}/made)')
+    output = tmp_path / 'kept'
+    forwarded(python(KEEP, str(output)) + f' ; touch {tmp_path}/made $(touch {tmp_path}/made)')
     assert [path.name for path in tmp_path.iterdir()] == ['kept']
 
 
@@ -210,10 +210,10 @@ def drifting(path: Path, *more: str) -> Path:
 
 
 def test_a_replay_hands_on_its_alarms(server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, kept = drifting(tmp_path / 'drift.csv'), tmp_path / 'kept'
-    argv = ['replay', str(path), '--watch', '--watch-command', python(KEEP, str(kept)), '--watch-webhook', server.url]
+    path, output = drifting(tmp_path / 'drift.csv'), tmp_path / 'kept'
+    argv = ['replay', str(path), '--watch', '--watch-command', python(KEEP, str(output)), '--watch-webhook', server.url]
     assert main(argv) == 0
-    reported = json.loads(kept.read_text())
+    reported = json.loads(output.read_text())
     assert reported == json.loads(server.got[0])
     assert reported['recording'] == str(path)
     assert reported['text'].partition(': ')[2] in capsys.readouterr().out

@@ -74,8 +74,8 @@ def test_what_is_determined_grows_with_the_recording(bag: Path, tmp_path: Path) 
     assert full.progress is not None
     assert (half.ended, full.ended) == (False, True)
     assert half.progress.determined > 0
-    left = [sum(parameter.sd_ratio for parameter in progress.parameters) for progress in (half.progress, full.progress)]
-    assert left[1] < left[0]
+    sums = [sum(parameter.sd_ratio for parameter in progress.parameters) for progress in (half.progress, full.progress)]
+    assert sums[1] < sums[0]
     assert half.progress.seconds < full.progress.seconds == pytest.approx(len(LOADS), abs=0.01)
     assert bench.looks[1] - bench.looks[0] >= LEAST_PAUSE_S
     assert bench.looks == pytest.approx([0.0, 3.0, 5.0], abs=2 * LOOK_S)

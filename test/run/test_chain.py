@@ -69,26 +69,26 @@ class Running:
             pass
 
     def until(self, wanted: Callable[[Composed], bool]) -> Composed:
-        while not wanted(one := self.composed.get(timeout=WAIT_S)):
+        while not wanted(composed := self.composed.get(timeout=WAIT_S)):
             pass
-        return one
+        return composed
 
 
 @pytest.fixture
 def running(file: ChainFile, devices: list[ScriptedDevice], sample: Sample) -> Iterator[Running]:
-    one = Running(file)
-    one.send(devices, sample, 200)
-    yield one
-    one.chain.close()
+    run = Running(file)
+    run.send(devices, sample, 200)
+    yield run
+    run.chain.close()
 
 
 def test_the_end_effector_is_composed_of_both(running: Running) -> None:
-    one = running.until(lambda c: c.end is not None)
-    assert one.end is not None
-    assert np.abs(one.end.vector).max() < 1e-9
-    record = one.as_record()
+    composed = running.until(lambda c: c.end is not None)
+    assert composed.end is not None
+    assert np.abs(composed.end.vector).max() < 1e-9
+    record = composed.as_record()
     assert record is not None
-    assert record.t_ns == one.t_ns
+    assert record.t_ns == composed.t_ns
     assert len(record.covariance) == 36
     first, second = (session.acquisition.to_ros_ns for session in running.chain.sessions)
     assert first == second
@@ -103,8 +103,8 @@ def test_one_end_effector_is_composed_at_a_time(running: Running, file: ChainFil
     chain = ChainSession(file, null_log)
     inside, go_on, composed = threading.Event(), threading.Event(), []
 
-    def listener(one: Composed) -> None:
-        composed.append(one.t_ns)
+    def listener(message: Composed) -> None:
+        composed.append(message.t_ns)
         inside.set()
         go_on.wait(WAIT_S)
 
@@ -134,9 +134,9 @@ def test_a_link_that_is_away_is_missing_and_named(running: Running, devices: lis
     # The stamps of what would come from the other device, without waiting for them.
     for block in range(1, 2 * PATIENCE):
         running.chain.take(0, upper._replace(t_ns=last.t_ns + 10**9 + block * 20_000_000))
-    one = running.until(lambda c: c.end is None)
-    assert one.why == 'fore: no estimate'
-    assert one.as_record() is None
+    composed = running.until(lambda c: c.end is None)
+    assert composed.why == 'fore: no estimate'
+    assert composed.as_record() is None
     assert running.chain.missing['fore'] > 0
     running.heard('end effector: not composed: fore: no estimate')
     running.until(lambda c: c.t_ns > last.t_ns + 10**9)
@@ -145,9 +145,9 @@ def test_a_link_that_is_away_is_missing_and_named(running: Running, devices: lis
 def test_a_turned_joint_counts_from_the_next_time_on(
     running: Running, devices: list[ScriptedDevice], sample: Sample
 ) -> None:
-    one = running.until(lambda c: c.end is not None)
-    assert one.end is not None
-    assert one.end.rigid.position == pytest.approx([0.0, 0.0, 1.27])
+    composed = running.until(lambda c: c.end is not None)
+    assert composed.end is not None
+    assert composed.end.rigid.position == pytest.approx([0.0, 0.0, 1.27])
     running.chain.set_angles({'shoulder': np.pi / 2, 'wrist': 1.0})
     assert running.chain.angles == (np.pi / 2, 0.0)
     running.send(devices, sample, 200)
@@ -167,11 +167,11 @@ def test_what_cannot_be_composed_ends_no_measurement(
     with monkeypatch.context() as broken:
         broken.setattr(Chain, 'compose', no_answer)
         running.send(devices, sample, 200)
-        one = running.until(lambda c: c.end is None)
-        assert one.why == 'cannot be composed (SVD did not converge)'
+        composed = running.until(lambda c: c.end is None)
+        assert composed.why == 'cannot be composed (SVD did not converge)'
         running.heard('end effector: not composed: cannot be composed (SVD did not converge)')
     running.send(devices, sample, 200)
-    running.until(lambda c: c.end is not None and c.t_ns > one.t_ns)
+    running.until(lambda c: c.end is not None and c.t_ns > composed.t_ns)
     assert running.chain.failed is None
 
 

@@ -82,11 +82,11 @@ def gate(first: Mapping[str, object] | None = None, *, volts: bool = False) -> H
 )
 def test_what_does_not_fit_is_rejected_at_the_start_and_later(changes: dict[str, object], message: str) -> None:
     for before in (gate(), gate(GOOD)):
-        kept = before.hello
+        hello = before.hello
         with pytest.raises(DeviceError, match=f'port: HELLO has {message}') as error:
             before.take(HelloFrame(1, info(**changes)), 'port', volts=False)
         assert len(str(error.value)) < 400
-        assert (before.hello, before.volts_per_count) == (kept, VOLTS)
+        assert (before.hello, before.volts_per_count) == (hello, VOLTS)
 
 
 def test_volts_only_if_the_source_says_so() -> None:
@@ -314,9 +314,9 @@ def bag(device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pyt
 def test_a_restart_is_recorded_and_no_command_invents_a_loss(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command, more in (('info', ()), ('replay', ('--compare',)), ('plot', ('--out', str(bag.parent / 'a.svg')))):
         assert main([command, str(bag), *more, '--json']) == 0
-        found = json.loads(capsys.readouterr().out)
-        assert found['lost'] == 0
-        assert command != 'info' or (found['samples'], found['restarts']) == (SENT, 4)
+        tree = json.loads(capsys.readouterr().out)
+        assert tree['lost'] == 0
+        assert command != 'info' or (tree['samples'], tree['restarts']) == (SENT, 4)
     assert main(['convert', str(bag), '--out', str(bag.parent / 'again.mcap')]) == 0
     capsys.readouterr()
     assert main(['info', str(bag.parent / 'again.mcap')]) == 0

@@ -115,8 +115,8 @@ def test_line_per_second_for_a_day_is_few_lines() -> None:
     assert len(logged) < 40
     rate_limited_log.settle(1000.0 + 86_400 + LONGEST_WAIT_S)
     last = logged.pop()
-    counted = sum(int(line.split('(and ')[1].split()[0]) for line in logged if '(and ' in line)
-    assert counted + len(logged) + int(last.split(' more in')[0]) == 86_400
+    repeats = sum(int(line.split('(and ')[1].split()[0]) for line in logged if '(and ' in line)
+    assert repeats + len(logged) + int(last.split(' more in')[0]) == 86_400
 
 
 def test_what_was_counted_is_reported_when_it_is_due() -> None:

@@ -265,15 +265,15 @@ def test_flushed_messages_survive_a_missing_end(tmp_path: Path) -> None:
     run.put(3)
     file = run.folder / f'{run.folder.name}_0.mcap'
     watch = threading.Event()
-    found: list[SampleBlock] = []
+    blocks: list[SampleBlock] = []
     for _ in range(3000):
         (tmp_path / 'left.mcap').write_bytes(file.read_bytes())
         recording = open_recording(tmp_path / 'left.mcap')
         if recording.topics():
-            found = list(recording.blocks())
+            blocks = list(recording.blocks())
             break
         watch.wait(0.02)
-    assert [b.index for b in found] == [0, 1, 2]
+    assert [b.index for b in blocks] == [0, 1, 2]
     run.stop()
 
 
@@ -374,9 +374,9 @@ class Live:
 def hanging_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[HangingDisk]:
     # However busy the machine is: only what a test does makes a device silent.
     monkeypatch.setattr(session_module, 'SILENT_S', 1e3)
-    one = HangingDisk(monkeypatch)
-    yield one
-    one.go_on.set()
+    disk = HangingDisk(monkeypatch)
+    yield disk
+    disk.go_on.set()
     for thread in threading.enumerate():
         if thread.name in ('recorder', 'zero'):
             thread.join(WAIT_S)
@@ -384,12 +384,12 @@ def hanging_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[HangingDisk]:
 
 @pytest.fixture
 def live(hanging_disk: HangingDisk, device: ScriptedDevice, sample: Sample, tmp_path: Path) -> Iterator[Live]:
-    one = Live(device, sample, tmp_path / 'bags')
-    one.session.start()
-    one.flow()
-    yield one
+    made = Live(device, sample, tmp_path / 'bags')
+    made.session.start()
+    made.flow()
+    yield made
     hanging_disk.go_on.set()
-    one.session.close()
+    made.session.close()
 
 
 def recorders() -> list[threading.Thread]:
@@ -557,10 +557,10 @@ def stalled(
 ) -> Live:
     """A run that has begun with a recording for which the disk hangs."""
     monkeypatch.setattr(session_module, 'OPEN_S', 0.01)
-    one = Live(device, sample, tmp_path / 'bags', record=True)
+    made = Live(device, sample, tmp_path / 'bags', record=True)
     hanging_disk.hang('open')
-    one.session.start()
-    return one
+    made.session.start()
+    return made
 
 
 def test_a_disk_that_hangs_does_not_hold_up_the_start_of_a_run(hanging_disk: HangingDisk, stalled: Live) -> None:
@@ -587,11 +587,11 @@ def test_a_late_disk_error_is_reported(hanging_disk: HangingDisk, stalled: Live,
 
 def test_a_disk_that_rejects_at_once_ends_the_start(device: ScriptedDevice, sample: Sample, tmp_path: Path) -> None:
     (tmp_path / 'bags').write_text('a file')
-    one = Live(device, sample, tmp_path / 'bags', record=True)
+    made = Live(device, sample, tmp_path / 'bags', record=True)
     with pytest.raises(RecordingError, match='cannot be made'):
-        one.session.start()
-    one.session.close()
-    assert not one.session.processing.alive
+        made.session.start()
+    made.session.close()
+    assert not made.session.processing.alive
 
 
 def test_recording_without_pipeline_leaves_nothing(tmp_path: Path) -> None:
@@ -616,13 +616,13 @@ def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, hanging_disk:
     live.flow()
     hanging_disk.go_on.set()
 
-    def kept() -> object:
+    def stored() -> object:
         path = tmp_path / 'zero.json'
         return json.loads(path.read_text())['psd_1.zero'] if path.exists() else None
 
-    until(lambda: kept() == [1e-4, -2e-4])
+    until(lambda: stored() == [1e-4, -2e-4])
     live.session.close()
-    assert kept() == [1e-4, -2e-4]
+    assert stored() == [1e-4, -2e-4]
 
 
 @pytest.mark.slow

@@ -77,12 +77,12 @@ def chunks(rig: Rig, first: int) -> Iterator[RawChunk]:
     counts = RigSimulator(rig, 1).step(loads()).counts
     for block in range(BLOCKS):
         seq = np.arange(20 * block, 20 * block + 20)
-        kept = seq % 977 != 0
+        present = seq % 977 != 0
         yield RawChunk(
-            seq[kept] + 20 * first,
-            (seq[kept] + 1) * 1_000_000,
-            counts[seq[kept]],
-            np.zeros(int(kept.sum()), np.uint8),
+            seq[present] + 20 * first,
+            (seq[present] + 1) * 1_000_000,
+            counts[seq[present]],
+            np.zeros(int(present.sum()), np.uint8),
             rig.converter.volts_per_count,
         )
 

@@ -63,9 +63,9 @@ def running(
     # However busy the machine is: only what a test does makes a device silent or a request late.
     monkeypatch.setattr(module, 'SILENT_S', 1e3)
     monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', WAIT_S)
-    one = Running(device, sample, tmp_path / 'recordings')
-    yield one
-    one.session.close()
+    run = Running(device, sample, tmp_path / 'recordings')
+    yield run
+    run.session.close()
 
 
 def observed_session(running: Running) -> tuple[Session, Estimates]:
@@ -109,12 +109,12 @@ def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> 
     running.session.reject_input(LOAD, 'a number is not finite')
     running.session.processing.request(lambda: None)
     families = text_string_to_metric_families(text_of(ShownSession(running.session).metrics()))
-    found = {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
-    assert found[('psd_deflection_samples_total',)] == running.session.acquisition.counters.samples > 0
-    assert found[('psd_deflection_estimates_total',)] >= 5.0
-    assert found[('psd_deflection_messages_rejected_total', LOAD)] == 1.0
-    assert found[('psd_deflection_recording',)] == 0.0
-    assert not any('celsius' in key[0] or 'watch' in key[0] for key in found)
+    metrics = {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
+    assert metrics[('psd_deflection_samples_total',)] == running.session.acquisition.counters.samples > 0
+    assert metrics[('psd_deflection_estimates_total',)] >= 5.0
+    assert metrics[('psd_deflection_messages_rejected_total', LOAD)] == 1.0
+    assert metrics[('psd_deflection_recording',)] == 0.0
+    assert not any('celsius' in key[0] or 'watch' in key[0] for key in metrics)
 
 
 def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, device: ScriptedDevice) -> None:
@@ -263,10 +263,10 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
 
 def test_rejected_count_is_reported_after_last_message(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     """The health is asked once a second, whatever the run publishes."""
-    settled: queue.SimpleQueue[float] = queue.SimpleQueue()
-    monkeypatch.setattr(RateLimitedLog, 'settle', lambda _, now_s: settled.put(now_s))
+    times: queue.SimpleQueue[float] = queue.SimpleQueue()
+    monkeypatch.setattr(RateLimitedLog, 'settle', lambda _, now_s: times.put(now_s))
     HealthReporter(running.session).report(1)
-    assert settled.get(timeout=WAIT_S) <= time.monotonic()
+    assert times.get(timeout=WAIT_S) <= time.monotonic()
 
 
 ZERO = {'psd_1.zero': [1e-4, -2e-4], 'psd_2.zero': [3e-5, 0.0]}
@@ -288,12 +288,12 @@ def test_kept_zero_applies_only_to_the_same_device(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ('one', 'other'), [('Rig \u00c4', 'Rig \u00d6'), ('a' * 64 + 'x', 'a' * 64 + 'y'), ('', 'unknown'), ('A', 'A.')]
+    ('first', 'other'), [('Rig \u00c4', 'Rig \u00d6'), ('a' * 64 + 'x', 'a' * 64 + 'y'), ('', 'unknown'), ('A', 'A.')]
 )
-def test_two_serial_numbers_never_share_a_zero(rig: Rig, one: str, other: str) -> None:
-    assert ZeroStore(rig, one).save(replace_values(rig, ZERO)) == ''
+def test_two_serial_numbers_never_share_a_zero(rig: Rig, first: str, other: str) -> None:
+    assert ZeroStore(rig, first).save(replace_values(rig, ZERO)) == ''
     assert ZeroStore(rig, other).load(rig) == (rig, '', INFO)
-    assert ZeroStore(rig, one).load(rig)[0].values['psd_1.zero'] == ZERO['psd_1.zero']
+    assert ZeroStore(rig, first).load(rig)[0].values['psd_1.zero'] == ZERO['psd_1.zero']
 
 
 @pytest.mark.parametrize(
@@ -350,9 +350,9 @@ def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes, why: str) -> Non
 def test_a_kept_zero_is_checked_like_any_parameter(rig: Rig, zero: object) -> None:
     store = ZeroStore(rig, 'A')
     assert store.save(replace_values(rig, ZERO)) == ''
-    kept = json.loads(store.path.read_text())
+    stored = json.loads(store.path.read_text())
     assert store.load(rig)[0] is not rig
-    store.path.write_text(json.dumps({**kept, 'psd_1.zero': zero}))
+    store.path.write_text(json.dumps({**stored, 'psd_1.zero': zero}))
     passed_over(store, rig, 'psd_1.zero')
 
 

@@ -98,9 +98,9 @@ def observed(loads: list[tuple[float, float, float]], seconds: float, lost: rang
 
 @pytest.mark.parametrize('lost', [range(0), range(60, 80)])
 def test_the_last_step_is_found_to_a_tenth_of_a_block(lost: range) -> None:
-    found = observed([(0, 0, 0), (0, -10, 0), (5, -10, 0)], 4.0, lost).step_ns()
-    assert found is not None
-    assert found * 1e-9 == pytest.approx(8.0, abs=0.002)
+    step_ns = observed([(0, 0, 0), (0, -10, 0), (5, -10, 0)], 4.0, lost).step_ns()
+    assert step_ns is not None
+    assert step_ns * 1e-9 == pytest.approx(8.0, abs=0.002)
 
 
 def test_a_link_at_rest_has_no_step() -> None:

@@ -40,8 +40,8 @@ class Chain:
     """A pipeline, a fan-out and a watcher, as a session has them."""
 
     def __init__(self, folder: Path | None, **values: Any) -> None:
-        kept = {} if folder is None else {'watch_dir': str(folder)}
-        rig = load_rig(overrides={'watch': 'on', 'solvers': ['exact'], **kept, **values})
+        folders = {} if folder is None else {'watch_dir': str(folder)}
+        rig = load_rig(overrides={'watch': 'on', 'solvers': ['exact'], **folders, **values})
         self.logged: list[str] = []
         self.poses: dict[int, tuple[float, float, float]] = {}
         self.pipeline = Pipeline(rig)
@@ -87,14 +87,14 @@ BUMP = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_an_alarm_is_handed_on(tmp_path: Path) -> None:
-    kept = tmp_path / 'alarms'
-    chain = Chain(None, watch_command=f'sh -c "cat >> {kept}"')
+    output = tmp_path / 'alarms'
+    chain = Chain(None, watch_command=f'sh -c "cat >> {output}"')
     chain.feed(1.0)
     chain.load(0.0, 0.0, 0.0)
     chain.feed(10.0)
     chain.feed(10.0, BUMP)
     assert chain.watcher.close(WAIT_S) == ''
-    reported = json.loads(kept.read_text())
+    reported = json.loads(output.read_text())
     assert (reported['channel'], reported['device'], reported['node']) == ('x1', 'abc', '/arm/psd_estimator')
     values = dict(chain.watcher.entry().values)
     assert (values['alarms handed on'], values['alarms not handed on']) == ('1', '0')
@@ -290,6 +290,6 @@ def test_a_session_feeds_its_watch_and_reports_it(device: ScriptedDevice, sample
         session.close()
 
 
-@pytest.mark.parametrize(('given', 'kept'), [(True, 'on'), ('off', 'off'), (False, 'off')])
-def test_the_watch_is_switched_by_one_parameter(given: object, kept: str) -> None:
-    assert load_rig(overrides={'watch': given}).acquisition.watch == kept
+@pytest.mark.parametrize(('given', 'value'), [(True, 'on'), ('off', 'off'), (False, 'off')])
+def test_the_watch_is_switched_by_one_parameter(given: object, value: str) -> None:
+    assert load_rig(overrides={'watch': given}).acquisition.watch == value

@@ -50,14 +50,14 @@ class Answers(NamedTuple):
     checked: Checkup
     run: CalibrationRun
     log: list[str]
-    found: Discovery
+    discovery: Discovery
 
 
 def answers(volts: FloatArray, annotated: FloatArray) -> Answers:
     """Return what check, calibrate and discover say of a recording named x."""
     log: list[str] = []
     run = CalibrationRun('x', np.arange(len(annotated)) / 1000.0, volts, np.zeros(0), np.zeros((0, 3)), annotated)
-    found = discover([Observation('x', RIG, volts, annotated)], without=OTHERS)
+    discovery = discover([Observation('x', RIG, volts, annotated)], without=OTHERS)
     return Answers(
-        check(of_recording(RIG, volts, annotated, 'x')), with_effective_loads(run, RIG, log.append), log, found
+        check(of_recording(RIG, volts, annotated, 'x')), with_effective_loads(run, RIG, log.append), log, discovery
     )

@@ -52,24 +52,24 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_calibration_json_has_the_documented_shape(made: Path) -> None:
-    found: dict[str, Any] = json.loads((made / 'out' / 'calibration.json').read_text())
-    assert set(found['parameters']) == NAMES
-    for one in found['parameters'].values():
-        assert set(one) == {'value', 'sd', 'unit', 'file', 'used'}
-    matrix = np.array(found['covariance']['matrix'])
-    at = found['covariance']['names']
+    tree: dict[str, Any] = json.loads((made / 'out' / 'calibration.json').read_text())
+    assert set(tree['parameters']) == NAMES
+    for parameter in tree['parameters'].values():
+        assert set(parameter) == {'value', 'sd', 'unit', 'file', 'used'}
+    matrix = np.array(tree['covariance']['matrix'])
+    at = tree['covariance']['names']
     assert set(at) == NAMES
-    assert np.sqrt(np.diag(matrix)) == pytest.approx([found['parameters'][n]['sd'] for n in at])
-    assert set(found['noise']) == {'x1', 'y1', 'x2', 'y2'}
-    assert found['noise']['x1'] == pytest.approx(2e-3, rel=0.15)
-    assert found['gap']['heldout_after'] < 0.5 * found['gap']['heldout_before']
-    for direction in found['undetermined']:
+    assert np.sqrt(np.diag(matrix)) == pytest.approx([tree['parameters'][n]['sd'] for n in at])
+    assert set(tree['noise']) == {'x1', 'y1', 'x2', 'y2'}
+    assert tree['noise']['x1'] == pytest.approx(2e-3, rel=0.15)
+    assert tree['gap']['heldout_after'] < 0.5 * tree['gap']['heldout_before']
+    for direction in tree['undetermined']:
         assert sum(v * v for v in direction['direction'].values()) == pytest.approx(1.0, abs=0.2)
         assert direction['needs']
-    (recording,) = found['provenance']['recordings']
+    (recording,) = tree['provenance']['recordings']
     assert len(recording['sha256']) == 64
     # It was turned by 12 mrad, of which the crosstalk takes its share.
-    assert found['parameters']['psd_2.rotation']['value'] > 0.009
+    assert tree['parameters']['psd_2.rotation']['value'] > 0.009
 
 
 def test_the_rig_file_is_the_one_that_was_given_and_corrects(made: Path, tmp_path: Path) -> None:
@@ -167,17 +167,17 @@ def rung(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_modes_of_the_link_not_of_the_file(rung: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['identify', str(rung), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
+    tree = json.loads(capsys.readouterr().out)
     for axis in ('dx', 'dy'):
-        (mode,) = found['axes'][axis]['modes']
-        assert found['axes'][axis]['how'] == 'ring-down'
+        (mode,) = tree['axes'][axis]['modes']
+        assert tree['axes'][axis]['how'] == 'ring-down'
         assert mode['frequency'] == pytest.approx(11.0, rel=5e-4)
         assert mode['damping_ratio'] == pytest.approx(0.02, rel=0.03)
-    (torsion,) = found['axes']['theta']['modes']
+    (torsion,) = tree['axes']['theta']['modes']
     assert torsion['frequency'] == pytest.approx(21.0, rel=5e-4)
     assert torsion['damping_ratio'] == pytest.approx(0.01, rel=0.03)
-    assert found['axes']['dy']['shaper']['name'] in ('zv', 'mzv', 'zvd', 'ei')
-    assert set(found['parameters']) < set(load_rig(None).values)
+    assert tree['axes']['dy']['shaper']['name'] in ('zv', 'mzv', 'zvd', 'ei')
+    assert set(tree['parameters']) < set(load_rig(None).values)
 
 
 def test_a_link_at_rest_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,17 +213,17 @@ def late(moved: Path) -> Path:
 
 def test_offset_is_reported_and_removed_if_asked(moved: Path, late: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['validate', str(moved), '--reference', str(late), '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
+    tree = json.loads(capsys.readouterr().out)
     # The blocks' stamps lie in the middle of 20 samples; the row of the reference is the next one, half a sample on.
-    assert found['offset']['value'] == pytest.approx(-0.0125, abs=0.6e-3)
-    assert found['offset']['determined']
-    assert not found['offset']['applied']
-    assert found['rejected'] == {'blurred': 1}
-    without = found['solvers']['exact']['dy']['rms']
+    assert tree['offset']['value'] == pytest.approx(-0.0125, abs=0.6e-3)
+    assert tree['offset']['determined']
+    assert not tree['offset']['applied']
+    assert tree['rejected'] == {'blurred': 1}
+    without = tree['solvers']['exact']['dy']['rms']
     assert main(['validate', str(moved), '--reference', str(late), '--align', '--json']) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found['offset']['applied']
-    assert found['solvers']['exact']['dy']['rms'] < 0.01 * without
+    tree = json.loads(capsys.readouterr().out)
+    assert tree['offset']['applied']
+    assert tree['solvers']['exact']['dy']['rms'] < 0.01 * without
 
 
 def test_unsuitable_solver_is_reported_if_named(moved: Path) -> None:

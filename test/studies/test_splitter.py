@@ -19,7 +19,7 @@ FILE = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
 
 
 @pytest.mark.parametrize(
-    ('powers', 'allowed', 'kept'),
+    ('powers', 'allowed', 'satisfied'),
     [
         # Both together; each alone is enough (a quarter of 5 V is the least); one out is told; as spares; alike.
         ((1e-3, 1e-3), 1e-3, [True, True, True, True, True, True, True]),
@@ -30,14 +30,14 @@ FILE = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
         ((0.3e-3, 1e-3), 1e-3, [True, False, True, False, True, True, False]),
     ],
 )
-def test_the_three_rules(powers: tuple[float, float], allowed: float, kept: list[bool]) -> None:
-    assert [rule.satisfied for rule in rules(RIG, Lasers(powers, allowed))] == kept
+def test_the_three_rules(powers: tuple[float, float], allowed: float, satisfied: list[bool]) -> None:
+    assert [rule.satisfied for rule in rules(RIG, Lasers(powers, allowed))] == satisfied
 
 
 def test_the_numbers_of_the_rules() -> None:
-    both, one, two, share, _, _, spare = rules(RIG, Lasers((0.6e-3, 0.4e-3), 1e-3))
+    both, first, second, share, _, _, spare = rules(RIG, Lasers((0.6e-3, 0.4e-3), 1e-3))
     assert (both.value, both.limit) == pytest.approx((1e-3, 2e-3))
-    assert (one.value, two.value, one.limit) == pytest.approx((3.0, 2.0, 1.25))
+    assert (first.value, second.value, first.limit) == pytest.approx((3.0, 2.0, 1.25))
     assert share.value == pytest.approx(0.4)
     assert spare.value == pytest.approx(5.0 / 1.5)
 
@@ -86,9 +86,9 @@ def test_the_command_says_which_rule_is_broken(capsys: pytest.CaptureFixture[str
     assert 'NO' not in out
     assert 'laser 1 out: one of the two lasers is out' in out
     assert main([*words, '--allowed', '0.9e-3', '--json']) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert [rule['words'] for rule in found['rules'] if not rule['kept']] == ['both together']
-    assert found['phases'][3]['status'] == 'LASER_LOST'
+    tree = json.loads(capsys.readouterr().out)
+    assert [rule['words'] for rule in tree['rules'] if not rule['kept']] == ['both together']
+    assert tree['phases'][3]['status'] == 'LASER_LOST'
 
 
 @pytest.mark.parametrize(

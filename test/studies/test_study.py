@@ -48,7 +48,7 @@ def tracker(folder: Path) -> Path:
     noise = np.random.default_rng(1).standard_normal(run().pose[::20].shape) * (1e-5, 1e-5, 5e-4)
     rows = zip(run().samples['t_ns'][::20] * 1e-9, (run().pose[::20] + noise).tolist(), strict=True)
     path = folder / 'tracker.csv'
-    path.write_text('\n'.join(['t,dx,dy,theta', *(f'{t:.6f},{x},{y},{turn}' for t, (x, y, turn) in rows)]) + '\n')
+    path.write_text('\n'.join(['t,dx,dy,theta', *(f'{t:.6f},{x},{y},{theta}' for t, (x, y, theta) in rows)]) + '\n')
     return path
 
 
@@ -96,8 +96,8 @@ def kinds(of: type[StudyResult] = StudyResult) -> set[str]:
     for module in pkgutil.walk_packages(studies.__path__, 'psd_deflection.studies.'):
         importlib.import_module(module.name)
     # Another test may have added a study of its own.
-    own = {of.__name__} if not of.__abstractmethods__ and of.__module__.startswith('psd_deflection.') else set()
-    return own.union(*(kinds(each) for each in of.__subclasses__()))
+    names = {of.__name__} if not of.__abstractmethods__ and of.__module__.startswith('psd_deflection.') else set()
+    return names.union(*(kinds(each) for each in of.__subclasses__()))
 
 
 def test_every_kind_of_result_is_tested_here() -> None:
@@ -118,8 +118,8 @@ def test_a_result_draws_itself_and_is_a_table(kind: str, tmp_path: Path) -> None
         if isinstance(drawing, Chart):
             assert len([a for a in figure.axes if a.get_visible()]) == len(drawing.panels)
     assert result.plot()._repr_png_()[:4] == b'\x89PNG'
-    found = result.table()
-    assert {len(column.values) for column in (found.index, *found.columns)} == {rows(result)}
+    table = result.table()
+    assert {len(column.values) for column in (table.index, *table.columns)} == {rows(result)}
     pytest.importorskip('pandas')
     frame = result.to_pandas()
     assert list(frame.attrs['units']) == [frame.index.name, *frame.columns]

@@ -173,8 +173,8 @@ class Chain:
         jacobian = carried @ rest.tip_of_measured
         covariance = np.zeros((6, 6))
         for i, (link, tip) in enumerate(zip(self.links, tips, strict=True)):
-            own = jacobian[:, 3 * i : 3 * i + 3]
-            covariance += own @ tip.covariance @ own.T
+            columns = jacobian[:, 3 * i : 3 * i + 3]
+            covariance += columns @ tip.covariance @ columns.T
             if link.slope_ratio_sd:
                 per_ratio = np.array([-tip.pose[1], tip.pose[0]]) / link.length
                 by_ratio = carried[:, 6 * i + 3 : 6 * i + 5] @ per_ratio * link.slope_ratio_sd
@@ -400,11 +400,11 @@ class Joiner:
         neighbours = NEXT * self._blocks_ns[link]
         if not after or known[after].t_ns - known[after - 1].t_ns > neighbours:
             return None
-        zero, one = known[after - 1], known[after]
-        u = (t_ns - zero.t_ns) / (one.t_ns - zero.t_ns)
-        pose = (1.0 - u) * zero.pose + u * one.pose
-        covariance = (1.0 - u) ** 2 * zero.covariance + u**2 * one.covariance
-        if after > 1 and zero.t_ns - known[after - 2].t_ns <= neighbours:
-            curvature = 0.5 * u * (1.0 - u) * (one.pose - 2.0 * zero.pose + known[after - 2].pose)
+        earlier, later = known[after - 1], known[after]
+        u = (t_ns - earlier.t_ns) / (later.t_ns - earlier.t_ns)
+        pose = (1.0 - u) * earlier.pose + u * later.pose
+        covariance = (1.0 - u) ** 2 * earlier.covariance + u**2 * later.covariance
+        if after > 1 and earlier.t_ns - known[after - 2].t_ns <= neighbours:
+            curvature = 0.5 * u * (1.0 - u) * (later.pose - 2.0 * earlier.pose + known[after - 2].pose)
             covariance = covariance + np.outer(curvature, curvature)
         return TipDeflection(pose, covariance)

@@ -191,13 +191,13 @@ def _place(value: object, where: str) -> Transform:
     return of_position_and_angles(np.array(place.xyz), np.array(place.rpy))
 
 
-def _read(section: Section[T], value: object, where: str, others: tuple[str, ...] = ()) -> tuple[T, dict[str, Any]]:
-    """What ``section`` declares, and the ``others`` of the keys of a map."""
+def _read(section: Section[T], value: object, where: str, other_keys: tuple[str, ...] = ()) -> tuple[T, dict[str, Any]]:
+    """What ``section`` declares, and the ``other_keys`` of a map."""
     known = tuple(p.name for p in section.parameters.values())
-    tree = _map_of(value, where, (*known, *others))
+    tree = _map_of(value, where, (*known, *other_keys))
     # A key without a value is as good as none.
-    own = {name: tree[name] for name in known if tree.get(name) is not None}
-    return section.read(own, where), {name: tree[name] for name in others if name in tree}
+    values = {name: tree[name] for name in known if tree.get(name) is not None}
+    return section.read(values, where), {name: tree[name] for name in other_keys if name in tree}
 
 
 def _map_of(value: object, where: str, known: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -77,12 +77,12 @@ class Arm:
 
     def _frames(self, q: FloatArray) -> tuple[Transform, list[tuple[ArmJoint, Transform]]]:
         """The tip, and each joint that moves with its frame in the base."""
-        left = iter(q)
+        angles = iter(q)
         frame = IDENTITY
         at = []
         for joint in self._joints:
             if joint.kind in MOVABLE:
-                frame = frame @ joint.at(float(next(left)))
+                frame = frame @ joint.at(float(next(angles)))
                 at.append((joint, frame))
             else:
                 frame = frame @ joint.origin

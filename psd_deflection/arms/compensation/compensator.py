@@ -178,9 +178,9 @@ class Compensator:
         ours = sent - self._left_pose
         if self._has_t <= then:
             return ours
-        kept = self._has - self._left_pose
-        inside = np.minimum(ours, 0.0) - FOREIGN <= kept, kept <= np.maximum(ours, 0.0) + FOREIGN
-        return kept if np.all(inside) else none
+        offsets = self._has - self._left_pose
+        inside = np.minimum(ours, 0.0) - FOREIGN <= offsets, offsets <= np.maximum(ours, 0.0) + FOREIGN
+        return offsets if np.all(inside) else none
 
     @property
     def owed(self) -> bool:
@@ -340,10 +340,10 @@ class Compensator:
         if self._speaks or self._dry or self._has is None or (now - self._has_t > FOREIGN_S and not self._sums):
             return ''
         if self._sums:
-            kept = self._offsets_of_command()
-            worst = int(np.abs(kept).argmax())
-            what = f'the command of the controller keeps {kept[worst]:.3g} from here at {self.arm.names[worst]}'
-            return f'{what}: {self._unready}' if kept[worst] else ''
+            offsets = self._offsets_of_command()
+            worst = int(np.abs(offsets).argmax())
+            what = f'the command of the controller keeps {offsets[worst]:.3g} from here at {self.arm.names[worst]}'
+            return f'{what}: {self._unready}' if offsets[worst] else ''
         worst = int(np.abs(self._has).argmax())
         # What we sent last may still be on its way back to us.
         if abs(self._has[worst]) <= FOREIGN or (self._sent is not None and self._has_t - self._sent[1] <= FOLLOW_S):
@@ -506,8 +506,8 @@ class Compensator:
         low = np.clip(self.arm.lower - nominal, -settings.max_offset, 0.0)
         high = np.clip(self.arm.upper - nominal, 0.0, settings.max_offset)
         self._wanted = np.clip(self._offsets + step, low, high)
-        beyond = np.abs(self._offsets + step - self._wanted).max() > 1e-12
-        self._limited = bool(beyond or np.abs(step).max() > settings.max_rate * elapsed * (1.0 + 1e-9))
+        clipped = np.abs(self._offsets + step - self._wanted).max() > 1e-12
+        self._limited = bool(clipped or np.abs(step).max() > settings.max_rate * elapsed * (1.0 + 1e-9))
 
     def _observed_to_follow(self, jacobian: FloatArray) -> bool:
         """Whether the joints whose offsets count were seen to move with them."""

@@ -214,15 +214,15 @@ def shaper_of(settings: ShaperSettings) -> tuple[Shaper, str]:
     if settings.shaper == NONE:
         return Shaper(NONE, (0.0,), (1.0,)), f'trajectories pass through unchanged (shaper: {NONE})'
     modes = _modes(settings)
-    found = []
+    shapers = []
     for frequency, damping in modes:
-        one = (
+        mode_shaper = (
             recommended(frequency, 0.0, damping)
             if settings.shaper == RECOMMENDED
             else shaper(settings.shaper, frequency, damping)
         )
-        found.append(one)
-    out = in_series(found)
+        shapers.append(mode_shaper)
+    out = in_series(shapers)
     of = ' and '.join(f'{frequency:g} Hz, damping ratio {damping:g}' for frequency, damping in modes)
     return out, f'{out.name.upper()} for {of}; motions take {1e3 * out.duration:.0f} ms longer'
 
@@ -232,9 +232,9 @@ def trajectory_shaper(settings: ShaperSettings) -> tuple[TrajectoryShaper, str]:
 
     Raises ConfigError.
     """
-    found, described = shaper_of(settings)
+    input_shaper, described = shaper_of(settings)
     limits = read_limits(settings.urdf) if settings.urdf not in ('', DESCRIPTION) else {}
-    return TrajectoryShaper(found, limits, settings.max_step), described
+    return TrajectoryShaper(input_shaper, limits, settings.max_step), described
 
 
 def _modes(settings: ShaperSettings) -> list[tuple[float, float]]:

@@ -136,9 +136,9 @@ def checked(names: Sequence[str], times: Sequence[float], points: Sequence[Seque
                 raise ConfigError(f'point {i} has {len(values)} {QUANTITIES[k]}, must be {wanted} as of the others')
     states = np.array([[list(values) for values in point[:orders]] for point in points], dtype=np.float64)
     # NaN is no number within the bound.
-    beyond = np.argwhere(~(np.abs(states) <= LARGEST))
-    if len(beyond):
-        raise ConfigError(f'point {beyond[0, 0]} is not finite, or beyond {LARGEST:g}')
+    invalid = np.argwhere(~(np.abs(states) <= LARGEST))
+    if len(invalid):
+        raise ConfigError(f'point {invalid[0, 0]} is not finite, or beyond {LARGEST:g}')
     at = np.array(times, dtype=np.float64)
     late = np.flatnonzero(~(np.diff(at, prepend=-KINK_S) >= KINK_S * (1.0 - 1e-6)))
     if len(late):

@@ -287,8 +287,10 @@ class FixedArithmetic(FixedFunctions):
 
     def einsum(self, spec: str, *operands: AnyFloats) -> FloatArray:
         """See :class:`Arithmetic`. Factors from the left; sums as in :func:`in_pairs`, indices as ``spec`` has them."""
-        turns, summed = plan(spec)
-        views = [(a if axes is None else a.transpose(axes))[at] for (axes, at), a in zip(turns, operands, strict=True)]
+        layouts, summed = plan(spec)
+        views = [
+            (a if axes is None else a.transpose(axes))[at] for (axes, at), a in zip(layouts, operands, strict=True)
+        ]
         if summed == 1 and max([a.size for a in operands]) > AT_ONCE:
             # Row by row: the table of all products would not stay in the cache.
             count = max([len(view) for view in views])
@@ -312,8 +314,8 @@ class FixedArithmetic(FixedFunctions):
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
-        left, right = 'nam'[3 - np.ndim(a) :], 'mb'[: np.ndim(b)]
-        return self.einsum(f'{left},{right}->{left[:-1]}{right[1:]}', a, b)
+        a_axes, b_axes = 'nam'[3 - np.ndim(a) :], 'mb'[: np.ndim(b)]
+        return self.einsum(f'{a_axes},{b_axes}->{a_axes[:-1]}{b_axes[1:]}', a, b)
 
     def solve(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`. By elimination; the row with the largest number of the column is next."""

@@ -32,14 +32,14 @@ def plan(spec: str) -> tuple[tuple[tuple[tuple[int, ...] | None, tuple[Any, ...]
     terms = inputs.split(',')
     summed = ''.join(dict.fromkeys(c for c in inputs if c not in out and c != ','))
     order = summed + out
-    turns = []
+    layouts = []
     for term in terms:
         axes = tuple(term.index(c) for c in order if c in term)
         if len(axes) != len(term):
             raise ValueError(f'{spec}: an index is twice in {term}')
         at = tuple(slice(None) if c in term else None for c in order)
-        turns.append((axes if axes != tuple(range(len(axes))) else None, at))
-    return tuple(turns), len(summed)
+        layouts.append((axes if axes != tuple(range(len(axes))) else None, at))
+    return tuple(layouts), len(summed)
 
 
 def product_of(factors: Sequence[AnyFloats]) -> AnyFloats:
@@ -59,14 +59,14 @@ def in_pairs(rows: AnyFloats) -> FloatArray:
     rest = np.asarray(rows, dtype=np.float64)
     if len(rest) < 2:
         return np.asarray(rest[0]) if len(rest) else np.zeros(rest.shape[1:])
-    kept = _KEPT.by_shape
-    scratch = kept.get(rest.shape)
+    cache = _KEPT.by_shape
+    scratch = cache.get(rest.shape)
     if scratch is None:
         scratch = _Scratch(rest.shape)
         if rest.size <= _SMALL:
-            if len(kept) >= _MOST_SHAPES:
-                kept.clear()
-            kept[rest.shape] = scratch
+            if len(cache) >= _MOST_SHAPES:
+                cache.clear()
+            cache[rest.shape] = scratch
     return scratch.sum(rest)
 
 

@@ -86,7 +86,7 @@ def _twiddles(n: int, factor: int) -> tuple[FloatArray, ...]:
     """Cosines and sines before the last step (n / factor, factor, 1) and in it (factor, factor, 1, 1)."""
     rest = n // factor
     steps = np.arange(rest)[:, None] * np.arange(factor) % n
-    own = np.arange(factor)[:, None] * np.arange(factor) % factor
-    first, last = (np.asarray(-2.0 * math.pi * at / size, np.float64) for at, size in ((steps, n), (own, factor)))
+    inner = np.arange(factor)[:, None] * np.arange(factor) % factor
+    first, last = (np.asarray(-2.0 * math.pi * at / size, np.float64) for at, size in ((steps, n), (inner, factor)))
     before = [f(first)[:, :, None] for f in (_BY.cos_many, _BY.sin_many)]
     return *before, *(f(last)[:, :, None, None] for f in (_BY.cos_many, _BY.sin_many))

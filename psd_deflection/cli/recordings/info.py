@@ -91,11 +91,11 @@ def run(args: argparse.Namespace) -> int:
     recording = open_recording(path, namespace=args.namespace, span=args.span)
     with stage('counting messages', quiet=args.json):
         topics = recording.topics()
-    found = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))
+    info = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))
     if args.json:
-        print_json(found, indent=2)
+        print_json(info, indent=2)
         return 0
-    show(*_lines(found))
+    show(*_lines(info))
     return 0
 
 
@@ -106,36 +106,36 @@ def summary_of(name: str, namespace: str | None, span: Span) -> dict[str, Any]:
 
 
 def _many(args: argparse.Namespace, names: list[str]) -> int:
-    found: dict[str, dict[str, Any]] = {}
+    results: dict[str, dict[str, Any]] = {}
     with contextlib.ExitStack() as stack:
         out = None if args.out is None else stack.enter_context(ParquetFile(args.out, FIELDS))
         work = partial(summary_of, namespace=args.namespace, span=args.span)
-        failed = FLEET.run_each(args, names, work, found.__setitem__)
+        failed = FLEET.run_each(args, names, work, results.__setitem__)
         if out is not None:
-            FLEET.write_rows(out, names, {name: _row(one) for name, one in found.items()}, failed)
-    FLEET.notify_each(args, names, found, failed, HEAD, _line)
+            FLEET.write_rows(out, names, {name: _row(info) for name, info in results.items()}, failed)
+    FLEET.notify_each(args, names, results, failed, HEAD, _line)
     return 0
 
 
-def _row(found: Mapping[str, Any]) -> dict[str, object]:
-    texts = {name: '; '.join(found[name]) for name in ('lacks', 'warnings')}
+def _row(info: Mapping[str, Any]) -> dict[str, object]:
+    texts = {name: '; '.join(info[name]) for name in ('lacks', 'warnings')}
     return {
-        **found,
+        **info,
         **texts,
-        **{name: json.dumps(found[name]) for name in ('marks', 'clock_steps', 'topics', 'parameters')},
+        **{name: json.dumps(info[name]) for name in ('marks', 'clock_steps', 'topics', 'parameters')},
     }
 
 
-def _line(found: Mapping[str, Any]) -> list[str]:
-    state = 'complete' if found['complete'] and not found['warnings'] else 'damaged'
+def _line(info: Mapping[str, Any]) -> list[str]:
+    state = 'complete' if info['complete'] and not info['warnings'] else 'damaged'
     return [
         state,
-        f'{found["duration_s"]:.3f}',
-        str(found['samples']),
-        str(found['lost']),
-        str(found['flagged']),
-        f'{found["sample_rate_hz"]:.6g}',
-        str(len(found['lacks'])),
+        f'{info["duration_s"]:.3f}',
+        str(info['samples']),
+        str(info['lost']),
+        str(info['flagged']),
+        f'{info["sample_rate_hz"]:.6g}',
+        str(len(info['lacks'])),
     ]
 
 
@@ -143,45 +143,45 @@ def _row_of(name: str, text: str) -> str:
     return f'  {name:<12} {text}'
 
 
-def _lines(found: Mapping[str, Any]) -> list[str]:
-    out = [f'{found["path"]}: {found["bytes"] / 1e6:.2f} MB']
-    out += _lines_of_origin(found)
-    out += _lines_of_samples(found)
+def _lines(info: Mapping[str, Any]) -> list[str]:
+    out = [f'{info["path"]}: {info["bytes"] / 1e6:.2f} MB']
+    out += _lines_of_origin(info)
+    out += _lines_of_samples(info)
     out += [
         _row_of('marks' if i == 0 else '', f'{round(mark["t_s"], 3) + 0.0:9.3f} s  {mark["text"]}')
-        for i, mark in enumerate(found['marks'])
+        for i, mark in enumerate(info['marks'])
     ]
-    out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
+    out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(info['lacks'])]
     out.append('  topics')
-    width = max((len(t) for t in found['topics']), default=0)
-    out += [f'    {topic:<{width}}  {count}' for topic, count in sorted(found['topics'].items())]
-    out += _lines_of_parameters(found)
-    out += [f'  warning: {w}' for w in found['warnings']]
+    width = max((len(t) for t in info['topics']), default=0)
+    out += [f'    {topic:<{width}}  {count}' for topic, count in sorted(info['topics'].items())]
+    out += _lines_of_parameters(info)
+    out += [f'  warning: {w}' for w in info['warnings']]
     return out
 
 
-def _lines_of_origin(found: Mapping[str, Any]) -> list[str]:
+def _lines_of_origin(info: Mapping[str, Any]) -> list[str]:
     row = _row_of
-    out = [row('state', 'complete' if found['complete'] else 'INCOMPLETE, see below')]
-    if found['namespace']:
-        out.append(row('namespace', found['namespace']))
-    if found['version']:
-        by = f', node {found["node"]}' if found['node'] else ''
-        out.append(row('recorded by', f'psd_deflection {found["version"]}{by}'))
-    if found['made_with']:
+    out = [row('state', 'complete' if info['complete'] else 'INCOMPLETE, see below')]
+    if info['namespace']:
+        out.append(row('namespace', info['namespace']))
+    if info['version']:
+        node_text = f', node {info["node"]}' if info['node'] else ''
+        out.append(row('recorded by', f'psd_deflection {info["version"]}{node_text}'))
+    if info['made_with']:
         reported = [
-            f'{name} {sanitize(found["made_with"][name], 120)}' for name in NAMES[1:] if name in found['made_with']
+            f'{name} {sanitize(info["made_with"][name], 120)}' for name in NAMES[1:] if name in info['made_with']
         ]
         out.append(row('computed by', ', '.join(reported)))
-    if found['device_hello'] is not None:
-        hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}
+    if info['device_hello'] is not None:
+        hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in info['device_hello'].items()}
         out.append(row('device', ', '.join(f'{k} {v}' for k, v in hello.items())))
     return out
 
 
-def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
+def _lines_of_samples(info: Mapping[str, Any]) -> list[str]:
     row = _row_of
-    start, samples, lost = found['start_ns'], found['samples'], found['lost']
+    start, samples, lost = info['start_ns'], info['samples'], info['lost']
     if not samples:
         return [row('samples', 'none')]
     when = f'{start * 1e-9:.9f} s'
@@ -191,10 +191,10 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
     share = f'{100.0 * lost / (samples + lost):.3g} %'
     out = [
         row('start', when),
-        row('duration', f'{found["duration_s"]:.3f} s'),
-        row('samples', f'{samples} present, {lost} lost ({share}), {found["flagged"]} flagged'),
+        row('duration', f'{info["duration_s"]:.3f} s'),
+        row('samples', f'{samples} present, {lost} lost ({share}), {info["flagged"]} flagged'),
     ]
-    here = found['dropped_here']
+    here = info['dropped_here']
     if here['samples'] or here['messages']:
         out.append(
             row(
@@ -202,46 +202,46 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
                 f'{here["samples"]} samples, {here["messages"]} messages: the host that recorded was too slow',
             )
         )
-    if found['restarts']:
-        out.append(row('restarts', f'{found["restarts"]} of the device'))
-    if found['clock_steps']:
-        worst = max(found['clock_steps'], key=lambda step: abs(step['step_s']))
+    if info['restarts']:
+        out.append(row('restarts', f'{info["restarts"]} of the device'))
+    if info['clock_steps']:
+        worst = max(info['clock_steps'], key=lambda step: abs(step['step_s']))
         at, size = f'{(worst["t_ns"] - start) / 1e9:.3f} s', f'{worst["step_s"] * 1e3:+.1f} ms'
-        text = f'{len(found["clock_steps"])}, the largest at {at} by {size}: stamps before it are off by as much'
+        text = f'{len(info["clock_steps"])}, the largest at {at} by {size}: stamps before it are off by as much'
         out.append(row('clock steps', text))
-    if found['squeezed']:
-        out.append(row('squeezed', f'{found["squeezed"]} samples have stamps 1 ns apart after a step back'))
-    out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
-    if (moved := found['vibration']) is not None:
+    if info['squeezed']:
+        out.append(row('squeezed', f'{info["squeezed"]} samples have stamps 1 ns apart after a step back'))
+    out.append(row('rate', f'{info["sample_rate_hz"]:.6g} samples/s'))
+    if (moved := info['vibration']) is not None:
         size, hz, share = moved['rms_m'] * 1e6, moved['hz'], moved['share']
         out.append(
             row('vibrates', f'up to {size:.1f} µm rms near {hz:.3g} Hz, in {100.0 * share:.3g} % of the seconds')
         )
-    out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
+    out.append(row('blocks', f'{info["blocks"]} of up to {info["block_size"]} samples'))
     return out
 
 
-def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
+def _lines_of_parameters(info: Mapping[str, Any]) -> list[str]:
     out: list[str] = []
     # What says how a node runs describes no rig.
     running = {p.name for section in (ACQUISITION, MONITOR) for p in section.parameters.values()}
-    unknown = len(load_rig().flat().keys() - running - found['parameters'].keys()) if found['parameters'] else 0
-    if found['parameters'] and not found['changed_parameters']:
+    unknown = len(load_rig().flat().keys() - running - info['parameters'].keys()) if info['parameters'] else 0
+    if info['parameters'] and not info['changed_parameters']:
         out.append(f'  {"the recorded" if unknown else "all"} parameters at their defaults')
-    elif found['parameters']:
+    elif info['parameters']:
         out.append('  parameters that are not at their defaults')
-        out += [f'    {k} = {v}' for k, v in sorted(found['changed_parameters'].items())]
+        out += [f'    {k} = {v}' for k, v in sorted(info['changed_parameters'].items())]
     if unknown:
         out.append(f'  {unknown} parameters of a rig are not in the recording')
-    if found['as_in_the_thesis']:
+    if info['as_in_the_thesis']:
         out.append('  parameters as in the thesis rig, unless they were measured to be the same')
-        out += [f'    {text}' for text in found['as_in_the_thesis']]
+        out += [f'    {text}' for text in info['as_in_the_thesis']]
     # What the pipeline remembered at the start is for a replay, and for --json.
-    for c in found['changes']:
+    for c in info['changes']:
         values = {k: v for k, v in c['values'].items() if not k.startswith('state.')}
         remembered = f'{len(c["values"])} values that the estimator remembered, for a replay'
         reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or remembered
         # Of a part the first ones are older than its start.
-        since = (c['t_ns'] - found['start_ns']) / 1e9
+        since = (c['t_ns'] - info['start_ns']) / 1e9
         out.append(f'  {f"from {since:.3f} s on" if since >= 0.0005 else "at the start"}: {reported}')
     return out

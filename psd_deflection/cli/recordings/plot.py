@@ -318,9 +318,9 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
         heights = (3, 3, 3, 1.6, *([1.6] if inputs.loads else []))
         # In twelfths, so that the detectors share one half of the width.
         grid = figure.add_gridspec(len(heights), 12, height_ratios=heights)
-        left = [figure.add_subplot(grid[0, :6])]
-        left += [figure.add_subplot(grid[i, :6], sharex=left[0]) for i in range(1, len(heights))]
-        for axes, (key, label, scale, unit) in zip(left, _POSE, strict=False):
+        traces = [figure.add_subplot(grid[0, :6])]
+        traces += [figure.add_subplot(grid[i, :6], sharex=traces[0]) for i in range(1, len(heights))]
+        for axes, (key, label, scale, unit) in zip(traces, _POSE, strict=False):
             value, sd = table[key] * scale, table[f'sd_{key}'] * scale
             axes.fill_between(
                 t, value - 2 * sd, value + 2 * sd, color=COLORS[key], alpha=0.3, linewidth=0, rasterized=raster
@@ -332,27 +332,27 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
             _mark_losses(axes, table)
             _mark_inputs(axes, inputs, key, scale)
             _marks(axes, inputs)
-        if left[0].get_legend_handles_labels()[0]:
-            left[0].legend(loc='upper right', fontsize=8)
+        if traces[0].get_legend_handles_labels()[0]:
+            traces[0].legend(loc='upper right', fontsize=8)
         sums = [f'sum{n}' for n in range(1, len(rig.psds) + 1)]
         for key, color in zip(sums, _SUMS, strict=False):
-            left[3].plot(t, table[key], color=color, linewidth=0.9, label=key, rasterized=raster)
-        left[3].axhline(rig.estimator.sum_min, color=COLORS['quiet'], linestyle=':', linewidth=1)
-        left[3].set(
+            traces[3].plot(t, table[key], color=color, linewidth=0.9, label=key, rasterized=raster)
+        traces[3].axhline(rig.estimator.sum_min, color=COLORS['quiet'], linestyle=':', linewidth=1)
+        traces[3].set(
             ylabel='sum (V)',
             ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, *(np.nanmax(table[key]) for key in sums))),
         )
-        left[3].legend(loc='center right', fontsize=8, ncols=len(sums))
+        traces[3].legend(loc='center right', fontsize=8, ncols=len(sums))
         if inputs.loads:
-            _loads(left[4], inputs, float(t[-1]))
-        for axes in left[len(_POSE) :]:
+            _loads(traces[4], inputs, float(t[-1]))
+        for axes in traces[len(_POSE) :]:
             _marks(axes, inputs)
         for mark in inputs.marks[:MOST_WORDS]:
             words = sanitize(mark.text, LONGEST_WORDS)
             at = inputs.seconds(mark.t_ns)
-            where = left[0].get_xaxis_transform()
-            left[0].text(at, 0.97, f' {words}', rotation=90, fontsize=7, va='top', transform=where, clip_on=True)
-        left[-1].set_xlabel('t (s)')
+            where = traces[0].get_xaxis_transform()
+            traces[0].text(at, 0.97, f' {words}', rotation=90, fontsize=7, va='top', transform=where, clip_on=True)
+        traces[-1].set_xlabel('t (s)')
         for number in range(1, len(rig.psds) + 1):
             _detector(figure.add_subplot(grid[_place(number, len(rig.psds))]), table, rig, number, raster)
         _spectrum(figure.add_subplot(grid[2:, 6:]), spectrum, rig)

@@ -28,17 +28,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Repair and say what was done."""
-    found = []
+    repaired = []
     for path in args.recording:
         with stage(f'reading and repairing {path}', quiet=args.json):
             done = recover(path)
         for warning in (w for file in done.files for w in file.warnings):
             warn(warning)
-        found.append({'path': path, **in_json(done)})
+        repaired.append({'path': path, **in_json(done)})
         if not args.json:
             show(*_lines(path, done))
     if args.json:
-        print_json({'recordings': found})
+        print_json({'recordings': repaired})
     return 0
 
 

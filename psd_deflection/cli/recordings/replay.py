@@ -215,8 +215,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _watch_lines(watched: WatchedReplay, first_ns: int) -> list[str]:
-    found = alarm_sentences(watched.alarms, first_ns, str(watched.watch.state))
-    return [f'  watch: {sentence}' for sentence in found]
+    sentences = alarm_sentences(watched.alarms, first_ns, str(watched.watch.state))
+    return [f'  watch: {sentence}' for sentence in sentences]
 
 
 def _alarm_out(args: argparse.Namespace, recording: Recording) -> AlarmOut:
@@ -288,7 +288,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
     if args.params_file is not None:
         # What is wrong in it is so for all.
         load_rig(args.params_file)
-    found: dict[str, dict[str, object]] = {}
+    results: dict[str, dict[str, object]] = {}
     with contextlib.ExitStack() as stack:
         out: ParquetFile | None = None
         if args.out is not None:
@@ -298,13 +298,13 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
             ]
             out = stack.enter_context(ParquetFile(args.out, fields))
 
-        def take(name: str, one: Replayed) -> None:
-            found[name] = one.summary
-            for warning in one.warnings:
+        def take(name: str, replayed: Replayed) -> None:
+            results[name] = replayed.summary
+            for warning in replayed.warnings:
                 warn(warning)
             if out is not None:
-                cells = {c.name: c.values for c in one.columns}
-                out.put([name] * one.columns[0].values.size, cells)
+                cells = {c.name: c.values for c in replayed.columns}
+                out.put([name] * replayed.columns[0].values.size, cells)
 
         work = partial(
             replay_of,
@@ -317,8 +317,8 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
         failed = FLEET.run_each(args, names, work, take)
         if out is not None:
             out.close(failed)
-    FLEET.notify_each(args, names, found, failed, HEAD, partial(_line, strict=args.strict))
-    differs = args.compare and not all(_agrees(_counts(one), args.strict) for one in found.values())
+    FLEET.notify_each(args, names, results, failed, HEAD, partial(_line, strict=args.strict))
+    differs = args.compare and not all(_agrees(_counts(summary), args.strict) for summary in results.values())
     return DIFFERS if differs else 0
 
 
@@ -327,25 +327,25 @@ def _counts(summary: Mapping[str, Any]) -> Mapping[str, object]:
     return counts
 
 
-def _line(found: Mapping[str, Any], strict: bool) -> list[str]:
+def _line(summary: Mapping[str, Any], strict: bool) -> list[str]:
     state = 'replayed'
-    if found['compared'] is not None:
-        state = 'the same' if _agrees(_counts(found), strict) else 'DIFFERS'
-    rejected = sum(found['rejected'].values())
+    if summary['compared'] is not None:
+        state = 'the same' if _agrees(_counts(summary), strict) else 'DIFFERS'
+    rejected = sum(summary['rejected'].values())
     return [
         state,
-        f'{found["seconds"]:.1f}',
-        *(str(found[key]) for key in ('samples', 'lost', 'blocks', 'estimates')),
+        f'{summary["seconds"]:.1f}',
+        *(str(summary[key]) for key in ('samples', 'lost', 'blocks', 'estimates')),
         str(rejected),
     ]
 
 
 def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
-    found, stated = recording.sample_rate_hz, rig.converter.sample_rate_hz
-    if not found or abs(found - stated) < 0.01 * stated:
+    measured, stated = recording.sample_rate_hz, rig.converter.sample_rate_hz
+    if not measured or abs(measured - stated) < 0.01 * stated:
         return []
     return [
-        f'{recording.path}: has {found:.4g} samples a second, the rig says {stated:g} '
+        f'{recording.path}: has {measured:.4g} samples a second, the rig says {stated:g} '
         '(converter.sample_rate_hz): the stamps of shortened blocks are off'
     ]
 

@@ -121,15 +121,15 @@ def _intrinsics(args: argparse.Namespace, settings: CameraSettings) -> int:
     board = settings.of_kind(args.target or 'charuco')
     bar = tqdm(paths, unit=' images', delay=1.0, leave=False, disable=True if args.json else None, ncols=80)
     with contextlib.closing(bar):
-        found = calibrated(board, ((path, read_image(path)) for path in bar))
+        intrinsics = calibrated(board, ((path, read_image(path)) for path in bar))
     with _saved(out):
-        replace_file(out, found.as_yaml(out.stem).encode())
+        replace_file(out, intrinsics.as_yaml(out.stem).encode())
     if args.json:
-        print_json({'out': args.out, **found.summary()})
+        print_json({'out': args.out, **intrinsics.summary()})
         return 0
-    show(f'{out}: {found.used} of {len(paths)} images used, rms {found.rms:.3f} px')
-    show(*found.lines())
-    for path, reason in found.excluded:
+    show(f'{out}: {intrinsics.used} of {len(paths)} images used, rms {intrinsics.rms:.3f} px')
+    show(*intrinsics.lines())
+    for path, reason in intrinsics.excluded:
         warn(f'{path}: not used: {reason}')
     return 0
 
@@ -151,13 +151,13 @@ def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
     footage = Footage(args.what[0], settings.exposure)
     reference = CameraReference(settings, target_of)
     reasons = Tally()
-    found: list[FrameAnswer] = []
+    valid: list[FrameAnswer] = []
     with contextlib.closing(open_reference_file(out)) as sink:
         for answer in _answers(args, footage, reference, _Preview(args.show)):
             reasons.add(answer.words)
             sink.put(answer.t_ns, answer.as_record(), answer.words)
-            found = [*found[-999:], answer] if answer.status is Status.OK else found
-    _report(args, settings, reference, reasons, found)
+            valid = [*valid[-999:], answer] if answer.status is Status.OK else valid
+    _report(args, settings, reference, reasons, valid)
     return 0
 
 
@@ -168,19 +168,19 @@ class _Preview:
         if path is not None and not path.lower().endswith('.png'):
             raise UsageError(f'--show {path}: the name must end in .png')
         self._path = None if path is None else Path(path)
-        self._due = 0.0
+        self._next_time = 0.0
         self._last: tuple[Any, FrameAnswer] | None = None
         if self._path is not None:
             need_folder(self._path)
 
     def take(self, frame: Frame, answers: list[FrameAnswer]) -> None:
         """The answer of this frame, if it is among ``answers``."""
-        own = [answer for answer in answers if answer.t_ns == frame.t_ns]
-        if self._path is None or not own:
+        matching = [answer for answer in answers if answer.t_ns == frame.t_ns]
+        if self._path is None or not matching:
             return
-        self._last = frame.image, own[-1]
-        if time.monotonic() >= self._due:
-            self._due = time.monotonic() + PREVIEW_S
+        self._last = frame.image, matching[-1]
+        if time.monotonic() >= self._next_time:
+            self._next_time = time.monotonic() + PREVIEW_S
             self.write()
 
     def write(self) -> None:
@@ -221,14 +221,14 @@ def _report(
     settings: CameraSettings,
     reference: CameraReference,
     reasons: Tally,
-    found: list[FrameAnswer],
+    valid: list[FrameAnswer],
 ) -> None:
     good = reasons[str(Status.OK)]
     frames, rejected = reasons.total(), {words: count for words, count in reasons.most_common() if words != Status.OK}
     median = [
-        sorted(math.sqrt(float(a.covariance[i, i])) for a in found if a.covariance is not None)[len(found) // 2]
+        sorted(math.sqrt(float(a.covariance[i, i])) for a in valid if a.covariance is not None)[len(valid) // 2]
         for i in range(3)
-        if found
+        if valid
     ]
     rest = reference.rest
     if args.json:

@@ -113,24 +113,24 @@ class _Teller:
 
     def __init__(self, args: argparse.Namespace, display: Display, stream: TextIO | None) -> None:
         self._display, self._stream, self._json = display, stream, args.json
-        self._left: int | None = args.count
+        self._remaining: int | None = args.count
         self._queue: queue.SimpleQueue[Composed] = queue.SimpleQueue()
 
     def listen(self, chain: ChainSession) -> None:
         """Hear of every composed deflection."""
-        if self._json or self._stream is not None or self._left is not None:
+        if self._json or self._stream is not None or self._remaining is not None:
             chain.listeners.append(self._queue.put)
 
     def watch(self, chain: ChainSession) -> bool:
         """What came since the last time; True if it was enough."""
         for session in chain.sessions:
             self._display.note_recorded(session)
-        while self._left != 0:
+        while self._remaining != 0:
             try:
                 composed = self._queue.get_nowait()
             except queue.Empty:
                 break
-            self._left = None if self._left is None else self._left - 1
+            self._remaining = None if self._remaining is None else self._remaining - 1
             if self._stream is not None:
                 self._stream.write(csv_line(composed) + '\n')
             if self._json:
@@ -140,7 +140,7 @@ class _Teller:
             sys.stdout.flush()
         else:
             self._display.show(chain.composed, lambda rate: live_line(chain, rate))
-        return self._left == 0
+        return self._remaining == 0
 
 
 def csv_line(composed: Composed) -> str:

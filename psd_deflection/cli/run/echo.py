@@ -64,7 +64,7 @@ async def _echo(daemon: Daemon, count: int | None, as_json: bool) -> None:
     reported = messages(daemon)
     try:
         hello = (await anext(reported)).get('hello')
-        left = count
+        remaining = count
         async for message in reported:
             for values in message.get('rows', ()):
                 try:
@@ -79,8 +79,8 @@ async def _echo(daemon: Daemon, count: int | None, as_json: bool) -> None:
                     show(line)
                 # Whoever reads this through a pipe waits for it.
                 sys.stdout.flush()
-                left = None if left is None else left - 1
-                if left == 0:
+                remaining = None if remaining is None else remaining - 1
+                if remaining == 0:
                     return
     finally:
         await reported.aclose()

@@ -49,8 +49,8 @@ def answer(args: argparse.Namespace, result: StudyResult) -> int:
             files = result.files()
         folder = make_writable(args.out)
         save_all(files, folder)
-        *others, last = files
-        show(f'wrote {", ".join(others)} and {last} into {folder}', aside=args.json)
+        *names, last = files
+        show(f'wrote {", ".join(names)} and {last} into {folder}', aside=args.json)
     return 0
 
 

@@ -47,13 +47,13 @@ def calibrate_live(args: argparse.Namespace, asked: CalibrationOptions) -> Calib
     from psd_deflection.run.monitor.client import ask, recording_of
 
     daemon = daemon_of(args)
-    own = recording_of(daemon) is None
-    if own:
+    starts_recording = recording_of(daemon) is None
+    if starts_recording:
         ask(daemon, 'api/record', {'record': True})
     try:
         return _followed(args, asked, daemon)
     finally:
-        if own:
+        if starts_recording:
             # It may have ended, or the daemon with it.
             with contextlib.suppress(DaemonError):
                 ask(daemon, 'api/record', {'record': False})
@@ -142,7 +142,7 @@ class LiveDisplay:
         up = f'\x1b[{self._drawn}A' if self._drawn else ''
         wide = shutil.get_terminal_size().columns - 1
         # A line that the terminal itself wraps would count as one when it is drawn over.
-        lines = [part for one in lines for part in textwrap.wrap(sanitize(one, LONGEST_LINE), wide) or ['']]
+        lines = [part for line in lines for part in textwrap.wrap(sanitize(line, LONGEST_LINE), wide) or ['']]
         text = '\n'.join(lines)
         sys.stdout.write(f'\r{up}\x1b[J{text}\n')
         sys.stdout.flush()

@@ -99,13 +99,13 @@ def run(args: argparse.Namespace) -> int:
         given_as_option('load') if args.load or args.set else contextlib.nullcontext(),
         tqdm(total=draws, unit=' draws', delay=1.0, leave=False, disable=hidden, ncols=80) as bar,
     ):
-        found = budget(
+        result = budget(
             BudgetProblem(rig, inputs, load, args.method, draws, args.seed, args.params_file or ''), bar.update
         )
     if not chart_alone:
-        return answer(args, found)
-    print_answer(args, found)
-    save_figure(found.plot(), Path(args.out), dpi=150)
+        return answer(args, result)
+    print_answer(args, result)
+    save_figure(result.plot(), Path(args.out), dpi=150)
     if not args.json:
         show('', args.out)
     return 0

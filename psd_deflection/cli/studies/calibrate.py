@@ -140,8 +140,8 @@ def _reject_mixed(args: argparse.Namespace) -> None:
     elif not args.recordings and (args.check is not None or args.alone or args.each or not args.dark):
         raise UsageError('REC is missing: a recording with a reference or with known loads; --dark alone needs none')
     if args.check is not None:
-        others = (args.params_file, args.out, args.each or None, args.executor, args.dark or None)
-        if any(one is not None for one in others):
+        excluded = (args.params_file, args.out, args.each or None, args.executor, args.dark or None)
+        if any(option is not None for option in excluded):
             raise UsageError(
                 '--check RIG.yaml is for itself: give none of --params-file, --out, --each, --executor, --dark'
             )
@@ -182,28 +182,28 @@ def run(args: argparse.Namespace) -> int:
             bar.set_description_str(words)
             bar.update()
 
-        found = asked.calibrated(runs, rig, levels, progress, warn)
+        calibration = asked.calibrated(runs, rig, levels, progress, warn)
         progress('report')
-        files = found.files()
-    return _answer(args, found, files)
+        files = calibration.files()
+    return _answer(args, calibration, files)
 
 
 def _live(args: argparse.Namespace, asked: CalibrationOptions) -> int:
     if asked.params_file is not None:
         load_rig(asked.params_file)
     make_writable(args.out)
-    found = calibrate_live(args, asked)
-    return _answer(args, found, found.files())
+    calibration = calibrate_live(args, asked)
+    return _answer(args, calibration, calibration.files())
 
 
-def _answer(args: argparse.Namespace, found: Calibrated, files: Mapping[str, str]) -> int:
+def _answer(args: argparse.Namespace, calibration: Calibrated, files: Mapping[str, str]) -> int:
     """Write the files and say the answer."""
     out = Path(args.out)
     save_all(files, out)
     if args.json:
-        print(files[found.json_name].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
+        print(files[calibration.json_name].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
         return 0
-    show(*found.lines(), f'see {out / "report.html"}; use {out / "rig.yaml"} as --params-file')
+    show(*calibration.lines(), f'see {out / "report.html"}; use {out / "rig.yaml"} as --params-file')
     return 0
 
 
@@ -212,15 +212,15 @@ def answer_of(path: str, asked: CalibrationOptions) -> Any:
     warnings: list[str] = []
     rig = asked.rig([path], warnings.append)
     answer = asked.calibrated(asked.runs([path], rig), rig, (), lambda words: None, warnings.append)
-    found, files, tree = answer.calibration, answer.files(), answer.tree()
+    calibration, files, tree = answer.calibration, answer.files(), answer.tree()
     cells: dict[str, object] = {
-        'kind': found.kind,
-        'rejected': found.rejected or '',
-        'undetermined': len(found.undetermined),
-        'heldout_before': found.gap.heldout_before,
-        'heldout_after': found.gap.heldout_after,
-        **{name: one['value'] for name, one in tree['parameters'].items()},
-        **{f'sd {name}': one['sd'] for name, one in tree['parameters'].items()},
+        'kind': calibration.kind,
+        'rejected': calibration.rejected or '',
+        'undetermined': len(calibration.undetermined),
+        'heldout_before': calibration.gap.heldout_before,
+        'heldout_after': calibration.gap.heldout_after,
+        **{name: parameter['value'] for name, parameter in tree['parameters'].items()},
+        **{f'sd {name}': parameter['sd'] for name, parameter in tree['parameters'].items()},
         'result': files[answer.json_name],
     }
     return FLEET.TaskResult(files, cells, warnings)
@@ -295,14 +295,14 @@ def _check(args: argparse.Namespace) -> int:
             namespace=args.namespace,
             span=args.span,
         )
-        found = checking.check(runs, rig, alone=args.alone)
+        checked = checking.check(runs, rig, alone=args.alone)
     if args.json:
-        print_json(checking.result(found), indent=1)
+        print_json(checking.result(checked), indent=1)
         return 0
-    show(checking.sentence(found))
-    worst = int(abs(found.zero / found.zero_sd).argmax())
+    show(checking.sentence(checked))
+    worst = int(abs(checked.zero / checked.zero_sd).argmax())
     show(
-        f'unloaded readings against the file (µm): {", ".join(f"{v * 1e6:+.1f}" for v in found.zero)} '
-        f'± {found.zero_sd[worst] * 1e6:.1g}; ~/zero takes them anew'
+        f'unloaded readings against the file (µm): {", ".join(f"{v * 1e6:+.1f}" for v in checked.zero)} '
+        f'± {checked.zero_sd[worst] * 1e6:.1g}; ~/zero takes them anew'
     )
     return 0

@@ -72,5 +72,5 @@ def run(args: argparse.Namespace) -> int:
     poses = [tuple(pose) for pose in args.pose]
     with given_as_option('pose'):
         problem = CertificateProblem(rig, tree, inputs, poses, limits, fields, str(folder / 'rig.yaml'))
-        found = certify(problem)
-    return answer(args, Certified(found, problem))
+        certificate = certify(problem)
+    return answer(args, Certified(certificate, problem))

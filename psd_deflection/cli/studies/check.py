@@ -77,14 +77,14 @@ def run(args: argparse.Namespace) -> int:
         with stage('reading', quiet=args.json):
             observed = read_observation(recording, rig)
         volts = Wiring.from_rig(rig).to_device(observed.volts)
-        found = check(of_recording(rig, volts, observed.loads, args.recording))
+        checkup = check(of_recording(rig, volts, observed.loads, args.recording))
         if not args.json:
             show(f'{args.recording}: {observed.duration:.1f} s')
     else:
         if args.span != FULL:
             raise UsageError('--from, --to: are for a recording: give REC')
-        found = _guided(args)
-    return answer(args, found)
+        checkup = _guided(args)
+    return answer(args, checkup)
 
 
 def _guided(args: argparse.Namespace) -> Checkup:
@@ -95,9 +95,9 @@ def _guided(args: argparse.Namespace) -> Checkup:
     if rig.acquisition.port:
         reject(args, {'world': []}, 'is for the simulated rig: give no --port')
     shown = GuideDisplay(quiet=args.json)
-    found = run_guided(rig, in_the_world(rig, args.world), texts(shown.log), shown.update)
+    checkup = run_guided(rig, in_the_world(rig, args.world), texts(shown.log), shown.update)
     shown.end()
-    return found
+    return checkup
 
 
 class GuideDisplay:
@@ -106,7 +106,7 @@ class GuideDisplay:
     def __init__(self, quiet: bool) -> None:
         self._stream = sys.stderr if quiet else sys.stdout
         self._live = self._stream.isatty()
-        self._turn = 0
+        self._count = 0
 
     def log(self, text: str) -> None:
         """A prompt or a message."""
@@ -115,8 +115,8 @@ class GuideDisplay:
 
     def update(self, guide: Guide) -> None:
         """Show how far the dots have moved, and how long the push has been held."""
-        self._turn += 1
-        if not self._live or self._turn % 5:
+        self._count += 1
+        if not self._live or self._count % 5:
             return
         full = round(guide.progress * BAR)
         moved = '  '.join(f'{c} {v * 1e6:+8.1f}' for c, v in zip(DOTS, guide.moved.tolist(), strict=True))

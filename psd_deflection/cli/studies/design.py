@@ -238,10 +238,10 @@ class PlacementRow(NamedTuple):
 
 def placements(rig: Rig, room: placement.Room) -> list[PlacementRow]:
     """The rig's own placement, the same base line put opposite, and the best that the room holds."""
-    own = rig.centers
-    half = float(np.hypot(*(own[0] - own[1]))) / 2.0
+    centers = rig.centers
+    half = float(np.hypot(*(centers[0] - centers[1]))) / 2.0
     return [
-        PlacementRow('this rig', own),
+        PlacementRow('this rig', centers),
         PlacementRow('same base line, opposite', placement.opposite(half)),
         PlacementRow('best in the room', placement.best_pair(room)),
     ]
@@ -309,8 +309,8 @@ def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
         theta = f'{s.theta * MDEG:.3f}'
         deviations = [f'{s.dx * 1e6:.3f}', f'{s.dy * 1e6:.3f}', theta]
         rows.append([name, *_places(centers), *deviations, f'{scaled:.3f}', f'{in_metres:.3f}'])
-    own, best = by_choice[0], by_choice[-1]
-    gains = [a / b for a, b in zip(own, best, strict=True)]
+    current, best = by_choice[0], by_choice[-1]
+    gains = [a / b for a, b in zip(current, best, strict=True)]
     return (
         f'Placement, one standard deviation for {sigma * 1e6:.3f} µm on each reading, at rest:\n\n'
         + columns(rows)

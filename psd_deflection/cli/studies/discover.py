@@ -290,12 +290,12 @@ def run(args: argparse.Namespace) -> int:
         observations = asked.read(args.recordings, warn)
     make_writable(args.out)
     with _progress(args) as progress:
-        found = _searched(args, asked, observations, limits, progress)
+        discovery = _searched(args, asked, observations, limits, progress)
         if args.adopt is not None:
-            found = found.adopt(args.adopt)
+            discovery = discovery.adopt(args.adopt)
         progress('report')
-        files = found.files()
-    return _answered(args, found, files, _hints(args, found))
+        files = discovery.files()
+    return _answered(args, discovery, files, _hints(args, discovery))
 
 
 def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
@@ -310,10 +310,10 @@ def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
     make_writable(args.out)
     file = 'the thesis rig' if args.params_file is None else args.params_file
     with _progress(args) as progress:
-        found = isolable(rig, loads, args.isolable, without=args.without, params_file=file, progress=progress)
+        answer = isolable(rig, loads, args.isolable, without=args.without, params_file=file, progress=progress)
         progress('report')
-        files = found.files()
-    return _answered(args, found, files, [])
+        files = answer.files()
+    return _answered(args, answer, files, [])
 
 
 def _options(args: argparse.Namespace) -> DiscoverOptions:
@@ -359,34 +359,34 @@ def _searched(
     if args.make_it:
         record = _recorder(args, asked.rig() or observations[0].rig, Path(args.out))
         return run_loop(observations, search, record, limits=limits, most=args.at_most, progress=progress)
-    found = search(observations)
+    discovery = search(observations)
     progress('planning')
-    return planned(found, limits) if args.next else found
+    return planned(discovery, limits) if args.next else discovery
 
 
-def _answered(args: argparse.Namespace, found: StudyResult, files: Mapping[str, str], hints: Sequence[str]) -> int:
+def _answered(args: argparse.Namespace, answer: StudyResult, files: Mapping[str, str], hints: Sequence[str]) -> int:
     save_all(files, Path(args.out))
-    print_answer(args, found)
+    print_answer(args, answer)
     show(*hints, f'see {Path(args.out) / "report.html"}', aside=args.json)
     return 0
 
 
 def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str]:
     """What to type next."""
-    out, found = Path(args.out), answer.discovery if isinstance(answer, LoopResult) else answer
+    out, discovery = Path(args.out), answer.discovery if isinstance(answer, LoopResult) else answer
     hints = []
-    if args.adopt is not None and found.model_of_law is None:
+    if args.adopt is not None and discovery.model_of_law is None:
         hints.append(f'--adopt {args.adopt}: there is no law to adopt')
     elif args.adopt is not None:
         hints.append(f'{args.adopt} is an effect now: {effect_folders()[0] / args.adopt}.yaml')
-    elif found.model_of_law is not None:
+    elif discovery.model_of_law is not None:
         hints.append(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
     if isinstance(answer, LoopResult):
         if answer.outcome is None and answer.open is not None and answer.open.useful:
             hints += how_to_record(answer.open, out)
-    elif found.unsettled:
+    elif discovery.unsettled:
         hints.append('next: psd-deflection discover with these recordings and --next plans the recording that tells')
-    if found.effects and found.verdict == 'effects_found' and not (found.unsettled and not args.next):
+    if discovery.effects and discovery.verdict == 'effects_found' and not (discovery.unsettled and not args.next):
         hints.append(
             f'next: psd-deflection estimator --params-file {out / "model.yaml"} corrects readings for what it can'
         )
@@ -396,19 +396,19 @@ def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str
 def answer_of(path: str, asked: DiscoverOptions) -> Any:
     """The task for one of many recordings; its TaskResult."""
     warnings: list[str] = []
-    found = asked.discovered(asked.read([path], warnings.append), notify=warnings.append)
-    files = found.files()
+    discovery = asked.discovered(asked.read([path], warnings.append), notify=warnings.append)
+    files = discovery.files()
     cells: dict[str, object] = {
-        'verdict': found.verdict,
-        'effects': ', '.join(e.active.label for e in found.effects),
-        'unknown': len(found.unknown),
-        'setup': '; '.join(f'{f.name} {f.where}' for f in found.setup),
-        'gap_before': found.gap_before,
-        'gap_after': found.gap_after,
-        'gap_floor': found.gap_floor,
-        'heldout_before': found.gap_heldout_before,
-        'heldout_after': found.gap_heldout_after,
-        'simulations': found.simulations,
+        'verdict': discovery.verdict,
+        'effects': ', '.join(e.active.label for e in discovery.effects),
+        'unknown': len(discovery.unknown),
+        'setup': '; '.join(f'{f.name} {f.where}' for f in discovery.setup),
+        'gap_before': discovery.gap_before,
+        'gap_after': discovery.gap_after,
+        'gap_floor': discovery.gap_floor,
+        'heldout_before': discovery.gap_heldout_before,
+        'heldout_after': discovery.gap_heldout_after,
+        'simulations': discovery.simulations,
         'result': files['result.json'],
     }
     return FLEET.TaskResult(files, cells, warnings)

@@ -30,5 +30,5 @@ def run(args: argparse.Namespace) -> int:
     """Identify."""
     problem = read_identify(opened_recording(args), progress(args))
     with stage('looking for modes', quiet=args.json):
-        found = identify(problem)
-    return answer(args, found)
+        modes = identify(problem)
+    return answer(args, modes)

@@ -188,8 +188,8 @@ def linear_table() -> list[str]:
     for method in methods():
         if method.name in ('appendix_d_ols', 'appendix_d_wls'):
             solver = make_solver(method.name, geometry, **method.options)
-            found = float(solver.solve_many(dots, VARIANCES).pose[0, 2]) * MDEG
-            lines.append(f'{method.label:38} {found:.3f} mdeg')
+            theta_mdeg = float(solver.solve_many(dots, VARIANCES).pose[0, 2]) * MDEG
+            lines.append(f'{method.label:38} {theta_mdeg:.3f} mdeg')
     design = design_matrix(geometry.beams)
     lines += ['', 'Condition number of A (4.28), Frobenius (2-norm)']
     for label, length in (('A in mm', 1e-3), ('A in m', 1.0), ('θ times 0.1 m', 0.1)):

@@ -68,5 +68,5 @@ def run(args: argparse.Namespace) -> int:
         with_progress=progress(args),
     )
     with stage('comparing', quiet=args.json):
-        found = validate(problem)
-    return answer(args, found)
+        comparison = validate(problem)
+    return answer(args, comparison)

@@ -21,14 +21,14 @@ def cut_by_edges(
     """
     sigma = 0.5 * radius
     a, b = (-half - place) / sigma, (half - place) / sigma
-    left = np.maximum(ndtr(b) - ndtr(a), _LEAST_SHARE)
+    share = np.maximum(ndtr(b) - ndtr(a), _LEAST_SHARE)
     density = np.exp(-0.5 * a * a) - np.exp(-0.5 * b * b)
-    return left, sigma * density / (np.sqrt(2.0 * np.pi) * left)
+    return share, sigma * density / (np.sqrt(2.0 * np.pi) * share)
 
 
 def cut_disc(distance: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
     """Share of an even disc that one edge at ``distance`` from its centre leaves, and how far its centroid moves, m."""
     u = np.clip(distance / radius, -0.999, 1.0)
     root = np.sqrt(1.0 - u * u)
-    left = 1.0 - (np.arccos(u) - u * root) / np.pi
-    return left, (2.0 / (3.0 * np.pi)) * radius * root**3 / left
+    share = 1.0 - (np.arccos(u) - u * root) / np.pi
+    return share, (2.0 / (3.0 * np.pi)) * radius * root**3 / share

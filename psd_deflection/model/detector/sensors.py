@@ -136,8 +136,10 @@ class Pincushion(Sensor):
         """See :class:`Sensor`."""
         x, y = self.to_ratios(place).T
         part = np.broadcast_to(total, x.shape) / 4.0
-        right, left, up, down = 1.0 + x, 1.0 - x, 1.0 + y, 1.0 - y
-        return np.column_stack((part * left * down, part * right * up, part * right * down, part * left * up))
+        x_plus, x_minus, y_plus, y_minus = 1.0 + x, 1.0 - x, 1.0 + y, 1.0 - y
+        return np.column_stack(
+            (part * x_minus * y_minus, part * x_plus * y_plus, part * x_plus * y_minus, part * x_minus * y_plus)
+        )
 
 
 class Quadrant(Sensor):
@@ -172,8 +174,10 @@ class Quadrant(Sensor):
         """See :class:`Sensor`."""
         x, y = self.to_ratios(place).T
         part = np.broadcast_to(total, x.shape) / 4.0
-        right, left, up, down = 1.0 + x, 1.0 - x, 1.0 + y, 1.0 - y
-        return np.column_stack((part * right * up, part * left * up, part * left * down, part * right * down))
+        x_plus, x_minus, y_plus, y_minus = 1.0 + x, 1.0 - x, 1.0 + y, 1.0 - y
+        return np.column_stack(
+            (part * x_plus * y_plus, part * x_minus * y_plus, part * x_minus * y_minus, part * x_plus * y_minus)
+        )
 
     def from_ratios(self, ratios: FloatArray) -> FloatArray:
         """Places (n, 2), m, of ratios (n, 2): w/sqrt(2) erfinv, limited to 1.5 w."""

@@ -90,13 +90,13 @@ class VoltsToDots:
         ``electrodes`` (n, 4P): of PSD 1 in the order of its ``electrodes``, then of PSD 2 ..., each a current or what a
         transimpedance amplifier makes of it, V. The sums are in their unit. A PSD without light reads 0, its sum too.
         """
-        own = np.empty((len(electrodes), 3 * len(self.sensors)))
+        channels = np.empty((len(electrodes), 3 * len(self.sensors)))
         for psd, sensor in enumerate(self.sensors, start=1):
             first = self.wiring.input_of(psd) - 1
             four = electrodes[:, 4 * first : 4 * first + 4]
-            own[:, 3 * first : 3 * first + 2] = sensor.ratios(four)
-            own[:, 3 * first + 2] = sensor.sum_signal(four)
-        volts = self.wiring.to_psds(own)
+            channels[:, 3 * first : 3 * first + 2] = sensor.ratios(four)
+            channels[:, 3 * first + 2] = sensor.sum_signal(four)
+        volts = self.wiring.to_psds(channels)
         for psd, sensor in enumerate(self.sensors):
             both = volts[:, 3 * psd : 3 * psd + 2]
             both[:] = sensor.to_linear(both) / self.sensitivities[2 * psd : 2 * psd + 2]

@@ -104,7 +104,7 @@ def recommended(frequency: float, frequency_sd: float, damping: float) -> Shaper
     band = np.linspace(max(frequency - half_band, 0.1 * frequency), frequency + half_band, 41)
     candidates = sorted((shaper(kind, frequency, damping) for kind in KINDS), key=lambda s: s.duration)
     worst = [float(s.residual(band, damping).max()) for s in candidates]
-    for found, residual in zip(candidates, worst, strict=True):
+    for candidate, residual in zip(candidates, worst, strict=True):
         if residual <= TOLERATED:
-            return found
+            return candidate
     return candidates[int(np.argmin(worst))]

@@ -66,7 +66,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
     check_two_psds(rig, 'a calibration')
     v = np.zeros(len(ALL))
     clamp = dict.fromkeys(CLAMP, 0.0)
-    others: list[ActiveEffect] = []
+    other_effects: list[ActiveEffect] = []
     observed: dict[str, str] = {}
     listed: set[str] = set()
     tilts = False
@@ -80,21 +80,21 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
     for active in effects_of_rig(rig) if effects is None else effects:
         called = active.effect.calibrated_as
         if not called:
-            others.append(active)
+            other_effects.append(active)
             continue
-        for own, name in called.items():
+        for key, name in called.items():
             # Of one PSD an effect counts once, whatever its other choices are.
             full = f'psd_{active.values[PSD.name]:.0f}.{name}' if PSD in active.effect.parameters else name
-            if active.values[own] != active.effect.parameter(own).nominal or name == _AIMED:
+            if active.values[key] != active.effect.parameter(key).nominal or name == _AIMED:
                 _claim(observed, full, active)
             if name in clamp:
-                clamp[name] = active.values[own]
+                clamp[name] = active.values[key]
             elif name == _SLOPE:
-                v[SLOPE] = active.values[own]
+                v[SLOPE] = active.values[key]
             elif name == _AIMED:
-                aimed[int(active.values[PSD.name]) - 1] = active.values[own]
+                aimed[int(active.values[PSD.name]) - 1] = active.values[key]
             else:
-                v[INDEX[full]] += active.values[own]
+                v[INDEX[full]] += active.values[key]
         listed.add(active.effect.name)
         tilts = tilts or _SLOPE in called.values()
     for i, psd in enumerate(rig.psds):
@@ -103,7 +103,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         x, y = (z - (1.0 - aimed[i]) * (c - f) for z, c, f in zip(psd.zero, center, psd.center, strict=True))
         xp = FIXED
         v[ZERO + 2 * i : ZERO + 2 * i + 2] = response_of(v, i).reading(np.array(x), np.array(y), xp)
-    return RigVector(v, clamp, others, frozenset(listed), tilts)
+    return RigVector(v, clamp, other_effects, frozenset(listed), tilts)
 
 
 def _claim(claimed: dict[str, str], name: str, active: ActiveEffect) -> None:
@@ -170,10 +170,10 @@ def known_of_rig(rig: Rig) -> Known:
             raise ConfigError('calibration.correlations: contradict each other; take them from a calibration unchanged')
         # Rounding in the file leaves values a little below zero.
         correlation = xp.product(vectors * np.maximum(values, 0.0), vectors.T)
-    own = [i for i, name in enumerate(names) if name in INDEX]
-    at = np.array([INDEX[names[i]] for i in own], dtype=np.intp)
+    rows = [i for i, name in enumerate(names) if name in INDEX]
+    at = np.array([INDEX[names[i]] for i in rows], dtype=np.intp)
     joint = correlation * np.outer(sds, sds)
-    covariance[np.ix_(at, at)] = joint[np.ix_(own, own)]
+    covariance[np.ix_(at, at)] = joint[np.ix_(rows, rows)]
     return Known(covariance, True)
 
 
@@ -191,10 +191,10 @@ def rig_values(
     values: dict[str, object] = {'link.slope_ratio': float(p[SLOPE])}
     effects = list(vector.other_effects)
     for n in (1, 2):
-        own = {name: float(p[INDEX[name]]) for name in INDEX if name.startswith((f'psd_{n}.', f'beam_{n}.'))}
-        values[f'psd_{n}.center'] = [own[f'psd_{n}.center_x'], own[f'psd_{n}.center_y']]
-        values[f'psd_{n}.height'] = own[f'psd_{n}.height']
-        values[f'beam_{n}.angle'] = [own[f'beam_{n}.angle_x'], own[f'beam_{n}.angle_y']]
+        psd_values = {name: float(p[INDEX[name]]) for name in INDEX if name.startswith((f'psd_{n}.', f'beam_{n}.'))}
+        values[f'psd_{n}.center'] = [psd_values[f'psd_{n}.center_x'], psd_values[f'psd_{n}.center_y']]
+        values[f'psd_{n}.height'] = psd_values[f'psd_{n}.height']
+        values[f'beam_{n}.angle'] = [psd_values[f'beam_{n}.angle_x'], psd_values[f'beam_{n}.angle_y']]
         place = response_of(p, n - 1).place(p[ZERO + 2 * n - 2], p[ZERO + 2 * n - 1])
         values[f'psd_{n}.zero'] = [float(f'{x:.12g}') for x in place]
     # A clamp that gives less than nothing is the link's stiffness, not the clamp.
@@ -204,8 +204,8 @@ def rig_values(
             _add(effects, effect, {key: full[name] for key, name in called.items()})
             continue
         for n in (1, 2):
-            found = {key: float(p[INDEX[f'psd_{n}.{name}']]) for key, name in called.items()}
-            _add(effects, effect, found, {PSD.name: float(n)})
+            effect_values = {key: float(p[INDEX[f'psd_{n}.{name}']]) for key, name in called.items()}
+            _add(effects, effect, effect_values, {PSD.name: float(n)})
     return values, sort_effects(effects)
 
 
@@ -252,8 +252,8 @@ class ParameterCovariance:
         self._xp = xp
         scale = _scale(covariance)
         size, vectors = xp.eigen(covariance / np.outer(scale, scale))
-        kept = size > 1e-14
-        root = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
+        significant = size > 1e-14
+        root = scale[:, None] * vectors[:, significant] * np.sqrt(size[significant])
         levels = np.linspace(-1.0, 1.0, LEVELS)
         points = np.stack(np.meshgrid(levels, levels, levels), axis=0).reshape(3, -1)
         slopes = xp.product(dots_by_parameters(values, points * RANGE[:, None], length, xp), root)
@@ -291,11 +291,11 @@ class ParameterCovariance:
 def _pairs() -> list[tuple[int, int]]:
     """Which products of two make the products of four, each once."""
     second = [(i, j) for i in range(4) for j in range(i, 4)]
-    found: dict[tuple[int, ...], tuple[int, int]] = {}
+    pairs: dict[tuple[int, ...], tuple[int, int]] = {}
     for a, row in enumerate(second):
         for b, right in enumerate(second):
-            found.setdefault(tuple(sorted(row + right)), (a, b))
-    return list(found.values())
+            pairs.setdefault(tuple(sorted(row + right)), (a, b))
+    return list(pairs.values())
 
 
 _PAIRS = _pairs()
@@ -313,11 +313,11 @@ def dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, xp: Arith
     slopes = by_parameters(p, pose, length, xp).transpose(2, 0, 1).copy()
     read = readings(p, pose, length, xp)
     for psd in range(2):
-        own = slice(2 * psd, 2 * psd + 2)
+        rows = slice(2 * psd, 2 * psd + 2)
         response = response_of(p, psd)
         x, y = response.place(read[2 * psd], read[2 * psd + 1], xp)
         rotated = response.slopes(x, y, xp).transpose(2, 0, 1)
-        slopes[:, own] = xp.solve(rotated, slopes[:, own])
+        slopes[:, rows] = xp.solve(rotated, slopes[:, rows])
     return slopes
 
 

@@ -13,14 +13,16 @@ the reference section. The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (t
 """
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.model.plate.plate import Beam, Number, Pose, Row, Turns, turns_of
+from psd_deflection.model.plate.plate import Beam, Number, Pose, Rotations, Row, rotations_of
 from psd_deflection.records import FloatArray
 
 
-def _place(beam: Beam[Number], dx: Number, dy: Number, turns: Turns[Number]) -> tuple[Number, Number, Number, Number]:
+def _place(
+    beam: Beam[Number], dx: Number, dy: Number, rotations: Rotations[Number]
+) -> tuple[Number, Number, Number, Number]:
     """a_x, a_y, x, y as in the module's text."""
     lx, ly, height = beam
-    ct, st, cp, sp, co, so = turns
+    ct, st, cp, sp, co, so = rotations
     ax, ay = ct * lx - st * ly, st * lx + ct * ly
     across = ax * so + height
     return ax, ay, dx + (ax + height * so) / co, dy + ay / cp - across * sp / (cp * co)
@@ -30,10 +32,10 @@ def landing(beam: Beam[float], pose: Pose[float], arithmetic: Arithmetic = LIBRA
     """(x, y, dx, dy) of one laser's dot: m; m/m for dX, dY and m/rad for the angles."""
     dx, dy, theta, phi, omega = pose
     height = beam[2]
-    turn = arithmetic.cos_sin
-    turns = *turn(theta), *turn(phi), *turn(omega)
-    _, _, cp, sp, co, so = turns
-    ax, ay, x, y = _place(beam, dx, dy, turns)
+    cos_sin = arithmetic.cos_sin
+    rotations = *cos_sin(theta), *cos_sin(phi), *cos_sin(omega)
+    _, _, cp, sp, co, so = rotations
+    ax, ay, x, y = _place(beam, dx, dy, rotations)
     return (
         x,
         y,
@@ -53,4 +55,4 @@ def landings(
 ) -> tuple[FloatArray, FloatArray]:
     """x and y, m, from arrays whose shapes broadcast; for long runs of samples."""
     dx, dy, theta, phi, omega = pose
-    return _place(beam, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]
+    return _place(beam, dx, dy, rotations_of(theta, phi, omega, arithmetic))[2:]

@@ -143,8 +143,8 @@ class Room:
 
     def candidates(self, count: int = 24) -> FloatArray:
         """(n, 2): points on a grid, on the rim and on the edges and corners of the box that are inside."""
-        turn = 2.0 * math.pi * np.arange(8 * count) / (8 * count)
-        circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        angles = 2.0 * math.pi * np.arange(8 * count) / (8 * count)
+        circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
         x_min, y_min, x_max, y_max = self.box or (-self.radius, -self.radius, self.radius, self.radius)
         across, up = np.linspace(x_min, x_max, count), np.linspace(y_min, y_max, count)
         grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)

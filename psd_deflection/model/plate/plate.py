@@ -27,7 +27,7 @@ from psd_deflection.records import FloatArray
 
 Number = TypeVar('Number', float, FloatArray)
 
-Turns = tuple[Number, Number, Number, Number, Number, Number]
+Rotations = tuple[Number, Number, Number, Number, Number, Number]
 """Cosine and sine of theta, of phi, of omega."""
 
 Five = tuple[Number, Number, Number, Number, Number]
@@ -42,20 +42,22 @@ Pose = tuple[Number, Number, Number, Number, Number]
 """dX, dY m, theta, phi, omega rad."""
 
 
-def _point(beam: Beam[Number], dx: Number, dy: Number, turns: Turns[Number]) -> tuple[Number, Number, Number, Number]:
+def _point(
+    beam: Beam[Number], dx: Number, dy: Number, rotations: Rotations[Number]
+) -> tuple[Number, Number, Number, Number]:
     """x', y', q_x, q_y as in the module's docstring."""
     lx, ly, height = beam
-    ct, st, cp, sp, co, so = turns
+    ct, st, cp, sp, co, so = rotations
     y = (ly - dy + height * sp) / cp
     x = (lx - dx - height * so * cp - y * so * sp) / co
     return x, y, ct * x + st * y, ct * y - st * x
 
 
 def _rows(
-    x: Number, y: Number, qx: Number, qy: Number, height: Number, turns: Turns[Number]
+    x: Number, y: Number, qx: Number, qy: Number, height: Number, rotations: Rotations[Number]
 ) -> tuple[Five[Number], Five[Number]]:
     """Derivatives of q_x and of q_y."""
-    ct, st, cp, sp, co, so = turns
+    ct, st, cp, sp, co, so = rotations
     # (x', y') by dX: (-1/co, 0); by dY: (y_dx, y_dy); by phi; by omega: (o, 0).
     y_dy = -1.0 / cp
     y_dx = so * sp / (co * cp)
@@ -71,16 +73,16 @@ def _rows(
 def crossing(beam: Beam[float], pose: Pose[float], arithmetic: Arithmetic = LIBRARY) -> tuple[float, float, Row, Row]:
     """(q_x, q_y, dq_x, dq_y) of one beam: m; m/m for dX, dY and m/rad for the angles."""
     dx, dy, theta, phi, omega = pose
-    turn = arithmetic.cos_sin
-    turns = *turn(theta), *turn(phi), *turn(omega)
-    x, y, qx, qy = _point(beam, dx, dy, turns)
-    row_x, row_y = _rows(x, y, qx, qy, beam[2], turns)
+    cos_sin = arithmetic.cos_sin
+    rotations = *cos_sin(theta), *cos_sin(phi), *cos_sin(omega)
+    x, y, qx, qy = _point(beam, dx, dy, rotations)
+    row_x, row_y = _rows(x, y, qx, qy, beam[2], rotations)
     return qx, qy, row_x, row_y
 
 
-def turns_of(
+def rotations_of(
     theta: FloatArray, phi: FloatArray, omega: FloatArray, arithmetic: Arithmetic = LIBRARY
-) -> Turns[FloatArray]:
+) -> Rotations[FloatArray]:
     """Cosine and sine of each angle."""
     sin, cos = arithmetic.sin_many, arithmetic.cos_many
     return cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
@@ -94,11 +96,11 @@ def crossings(
     ``poses`` (..., 5): dX, dY m, theta, phi, omega rad; ``beams`` (P, 2) or (..., P, 2) m; ``heights`` (P,) m.
     """
     dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
-    turns = turns_of(theta, phi, omega, arithmetic)
-    x, y, qx, qy = _point((beams[..., 0], beams[..., 1], heights), dx, dy, turns)
+    rotations = rotations_of(theta, phi, omega, arithmetic)
+    x, y, qx, qy = _point((beams[..., 0], beams[..., 1], heights), dx, dy, rotations)
     points = np.stack((qx, qy), axis=-1)
     jacobian = np.empty((*points.shape, 5))
-    for axis, row in enumerate(_rows(x, y, qx, qy, heights, turns)):
+    for axis, row in enumerate(_rows(x, y, qx, qy, heights, rotations)):
         for i, derivative in enumerate(row):
             jacobian[..., axis, i] = derivative
     return points, jacobian
@@ -119,7 +121,7 @@ def points_under(
 ) -> tuple[FloatArray, FloatArray]:
     """q_x and q_y, m, from arrays whose shapes broadcast; for long runs of samples."""
     dx, dy, theta, phi, omega = pose
-    return _point(beam, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]
+    return _point(beam, dx, dy, rotations_of(theta, phi, omega, arithmetic))[2:]
 
 
 def points_under_leaning(
@@ -136,14 +138,14 @@ def points_under_leaning(
     """
     lx, ly, height = beam
     dx, dy, theta, phi, omega = pose
-    turns = turns_of(theta, phi, omega, arithmetic)
-    _, _, cp, sp, co, so = turns
-    x, y, qx, qy = _point(beam, dx, dy, turns)
+    rotations = rotations_of(theta, phi, omega, arithmetic)
+    _, _, cp, sp, co, so = rotations
+    x, y, qx, qy = _point(beam, dx, dy, rotations)
     for _ in range(3):
         # (x', y') is q turned by theta about the plate's normal; what is left of R is Ry(omega) Rx(phi).
         z = -so * x + co * sp * y + co * cp * height
         met = lx + slopes[0] * (z - height), ly + slopes[1] * (z - height), height
-        x, y, qx, qy = _point(met, dx, dy, turns)
+        x, y, qx, qy = _point(met, dx, dy, rotations)
     return qx, qy
 
 

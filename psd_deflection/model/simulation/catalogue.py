@@ -70,7 +70,7 @@ def _places() -> dict[str, Place]:
 
     names = [module.name for module in pkgutil.iter_modules(ours.__path__)]
     places: dict[str, Place] = {name: EntryPoint(name, f'{ours.__name__}.{name}:EFFECT', GROUP) for name in names}
-    others: list[tuple[str, Place]] = []
+    plug_ins: list[tuple[str, Place]] = []
     for folder in dict.fromkeys(effect_folders()):
         try:
             files = sorted(f for f in folder.iterdir() if f.suffix in ('.py', '.yaml'))
@@ -79,9 +79,9 @@ def _places() -> dict[str, Place]:
             if FOLDERS in os.environ:
                 raise ConfigError(f'{FOLDERS}: {folder}: cannot be read ({error.strerror or error})') from None
             continue
-        others += [(f.stem, f) for f in files if f.stem.isidentifier() and not f.stem.startswith('_')]
-    others += [(point.name, point) for point in entry_points(group=GROUP)]
-    for name, place in others:
+        plug_ins += [(f.stem, f) for f in files if f.stem.isidentifier() and not f.stem.startswith('_')]
+    plug_ins += [(point.name, point) for point in entry_points(group=GROUP)]
+    for name, place in plug_ins:
         if name in places:
             raise ConfigError(f'{_words(place)}: the effect {name} is in {_words(places[name])} already; rename one')
         places[name] = place
@@ -125,14 +125,14 @@ def _of_text(text: str, source: str) -> Effect:
 
 
 def _load(name: str, place: Place) -> Effect:
-    found = loaded(
+    effect = loaded(
         f'{_words(place)}: holds no effect', lambda: _of_file(place) if isinstance(place, Path) else place.load()
     )
-    if not isinstance(found, Effect):
-        raise ConfigError(f'{_words(place)}: EFFECT = {found!r}: must be an Effect')
-    if found.name != name:
-        raise ConfigError(f'{_words(place)}: name = {found.name!r}: must be {name!r}, like the file or entry point')
-    return found
+    if not isinstance(effect, Effect):
+        raise ConfigError(f'{_words(place)}: EFFECT = {effect!r}: must be an Effect')
+    if effect.name != name:
+        raise ConfigError(f'{_words(place)}: name = {effect.name!r}: must be {name!r}, like the file or entry point')
+    return effect
 
 
 def catalogue(psds: int = 2) -> Mapping[str, Effect]:
@@ -148,19 +148,19 @@ def effects_for(psds: int) -> list[Effect]:
     return [effect for effect in catalogue(psds).values() if effect.least_psds <= psds]
 
 
-def our_effects(*others: str) -> Mapping[str, Effect]:
-    """The package's own effects and ``others``, by name, as of two PSDs.
+def our_effects(*names: str) -> Mapping[str, Effect]:
+    """The package's own effects and those of ``names``, by name, as of two PSDs.
 
     What else a user has is not loaded, so it cannot fail.
     """
-    own = {module.name for module in pkgutil.iter_modules(ours.__path__)}
-    found = _loaded({name: place for name, place in _places().items() if name in own or name in others})
-    return {name: effect.on(2) for name, effect in found.items()}
+    package_names = {module.name for module in pkgutil.iter_modules(ours.__path__)}
+    effects = _loaded({name: place for name, place in _places().items() if name in package_names or name in names})
+    return {name: effect.on(2) for name, effect in effects.items()}
 
 
 def _loaded(places: Mapping[str, Place]) -> dict[str, Effect]:
-    found = [_load(name, place) for name, place in places.items()]
-    return {e.name: e for e in sorted(found, key=lambda e: e.rank)}
+    effects = [_load(name, place) for name, place in places.items()]
+    return {e.name: e for e in sorted(effects, key=lambda e: e.rank)}
 
 
 def make_active(name: str, values: Mapping[str, object], source: str, psds: int = 2) -> ActiveEffect:
@@ -251,7 +251,7 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
         if not dot:
             raise ConfigError(f'effects.{key} = {value!r}: must be a map with the name and the parameters of an effect')
         groups.setdefault(group, {})[name] = value
-    found = []
+    effects = []
     # Looked up once: it takes as long as a block.
     places = _places() if groups else {}
     for group, body in groups.items():
@@ -266,8 +266,8 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
                 f'effects.{group}: {name} is of a rig of {active.effect.least_psds} PSDs, this one has {len(rig.psds)} '
                 '(psd_N.center)'
             )
-        found.append(active)
-    return sort_effects(found)
+        effects.append(active)
+    return sort_effects(effects)
 
 
 def sort_effects(effects: Sequence[ActiveEffect]) -> list[ActiveEffect]:

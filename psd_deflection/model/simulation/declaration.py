@@ -250,15 +250,15 @@ class Effect:
 
     def _check_calibrated(self) -> None:
         called = list(self.calibrated_as.values())
-        if left := [p.name for p in self.parameters if called and p != PSD and p.name not in self.calibrated_as]:
+        if rest := [p.name for p in self.parameters if called and p != PSD and p.name not in self.calibrated_as]:
             raise ValueError(
-                f'calibrated_as: {", ".join(left)}: not named; a calibration finds all parameters of an effect or none'
+                f'calibrated_as: {", ".join(rest)}: not named; a calibration finds all parameters of an effect or none'
             )
         known = (*CALIBRATED_OF_PSD, *PLACED_OF_PSD) if PSD in self.parameters else CALIBRATED_OF_LINK
-        for own, name in self.calibrated_as.items():
+        for key, name in self.calibrated_as.items():
             if name not in known:
                 whose = 'a PSD' if PSD in self.parameters else 'the link'
-                raise ValueError(f'calibrated_as: {own} = {name!r}: a calibration finds of {whose}: {", ".join(known)}')
+                raise ValueError(f'calibrated_as: {key} = {name!r}: a calibration finds of {whose}: {", ".join(known)}')
         if len(set(called)) < len(called):
             raise ValueError(f'calibrated_as = {dict(self.calibrated_as)!r}: has a name twice')
         if 0 < len(set(called) & set(PLACED_OF_PSD)) < len(called):

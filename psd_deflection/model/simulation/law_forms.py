@@ -19,17 +19,17 @@ from psd_deflection.records import FloatArray
 def play(x: FloatArray, half_width: float, start: float) -> FloatArray:
     """Play operator over (n,) inputs from state ``start``; exact selections, no rounding of its own."""
     moved = np.flatnonzero(np.diff(x)) + 1
-    kept = np.concatenate(([0], moved))
-    low, high = x[kept] - half_width, x[kept] + half_width
+    changes = np.concatenate(([0], moved))
+    low, high = x[changes] - half_width, x[changes] + half_width
     reach = 1
-    while reach < len(kept):
+    while reach < len(changes):
         low0, high0 = low[:-reach], high[:-reach]
         low1, high1 = low[reach:], high[reach:]
         low = np.concatenate((low[:reach], np.minimum(np.maximum(low0, low1), high1)))
         high = np.concatenate((high[:reach], np.minimum(np.maximum(high0, low1), high1)))
         reach *= 2
-    settled = np.minimum(np.maximum(start, low), high)
-    return np.repeat(settled, np.diff(np.concatenate((kept, [len(x)]))))
+    outputs = np.minimum(np.maximum(start, low), high)
+    return np.repeat(outputs, np.diff(np.concatenate((changes, [len(x)]))))
 
 
 def above(v: FloatArray, shapes: Values) -> FloatArray:
@@ -100,11 +100,11 @@ def relaxed(v: FloatArray, shapes: Values, period: float, state: State) -> Float
     """v through a lag of first order."""
     # The input counts from one sample to the next as a straight line.
     a = period / shapes['tau']
-    kept = math.exp(-a)
-    ahead = 1.0 - (1.0 - kept) / a
-    b = np.array([ahead, 1.0 - kept - ahead])
+    decay = math.exp(-a)
+    ahead = 1.0 - (1.0 - decay) / a
+    b = np.array([ahead, 1.0 - decay - ahead])
     # Relaxed at zero before the first sample.
-    y, state['y'] = lfilter(b, [1.0, -kept], v, zi=state.get('y', np.array([b[1] * v[0]])))
+    y, state['y'] = lfilter(b, [1.0, -decay], v, zi=state.get('y', np.array([b[1] * v[0]])))
     return np.asarray(y)
 
 

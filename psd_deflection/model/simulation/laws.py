@@ -314,8 +314,8 @@ def _apply(law: Law, first: int, samples: SimulatedSamples, values: Values, stat
     target, n = TARGETS[law.acts_on], len(samples.t)
     added = np.zeros(n)
     for i, term in enumerate(_with_values(law.terms, first, values)):
-        own = state.setdefault(str(i), {})
-        grown = term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, own)
+        term_state = state.setdefault(str(i), {})
+        grown = term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, term_state)
         added += grown
     if law.acts_on.startswith('beam_'):
         # A beam that moves sideways moves the dot in the plate's own axes.

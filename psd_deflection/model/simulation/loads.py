@@ -37,9 +37,9 @@ class LoadHistory:
     def __len__(self) -> int:
         return len(self.loads)
 
-    def then(self, *others: LoadHistory) -> LoadHistory:
+    def then(self, *following: LoadHistory) -> LoadHistory:
         """This history, followed by the others (all at its rate)."""
-        return LoadHistory(np.concatenate([self.loads, *(o.loads for o in others)]), self.sample_rate_hz)
+        return LoadHistory(np.concatenate([self.loads, *(o.loads for o in following)]), self.sample_rate_hz)
 
 
 def sidebar(force: float) -> tuple[float, float, float]:
@@ -200,7 +200,7 @@ def _seconds(text: str, source: str) -> float:
 
 def load_histories(words: Sequence[str], rate: float, parameter: str = 'loads') -> LoadHistory:
     """The histories of several ``words``, one after the other. Raises as :func:`load_history`."""
-    parts = [load_history(one, rate, parameter) for one in words]
+    parts = [load_history(word, rate, parameter) for word in words]
     return parts[0].then(*parts[1:])
 
 

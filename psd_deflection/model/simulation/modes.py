@@ -35,9 +35,9 @@ def mode_coefficients(
     decay = math.exp(-damping_ratio * w * phase)
     speed = decay * math.sin(wd * phase) / wd
     place = decay * math.cos(wd * phase) + damping_ratio * w * speed
-    kept, moved = e * (c + r), e * s / wd
-    phi = ((kept, moved), (-w * w * moved, kept - 2.0 * damping_ratio * w * moved))
-    gamma = (1.0 - kept, w * w * moved)
+    phi_11, phi_12 = e * (c + r), e * s / wd
+    phi = ((phi_11, phi_12), (-w * w * phi_12, phi_11 - 2.0 * damping_ratio * w * phi_12))
+    gamma = (1.0 - phi_11, w * w * phi_12)
     numerator = (1.0 - place) * denominator
     numerator[1] += place * gamma[0] + speed * gamma[1]
     numerator[2] += place * (phi[0][1] * gamma[1] - phi[1][1] * gamma[0])

@@ -119,10 +119,10 @@ class BasePairSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         measured = [c + m for c, m in zip(self._centers, dots, strict=True)]
-        found = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances, self._xp)
-        xp, of_beams = self._xp, np.array(found.covariance)
+        minimum = fit(self._model, (0.0,) * self._matrix.shape[1], measured, variances, self._xp)
+        xp, of_beams = self._xp, np.array(minimum.covariance)
         covariance = xp.product(xp.product(self._matrix[:3], of_beams), self._matrix[:3].T).tolist()
-        return answer(found, xp.product(self._matrix, np.array(found.parameters)).tolist(), covariance)
+        return answer(minimum, xp.product(self._matrix, np.array(minimum.parameters)).tolist(), covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         total = self._xp.total

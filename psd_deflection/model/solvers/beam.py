@@ -65,9 +65,9 @@ class BeamSolver(Solver):
         """One block, pure floats. See :class:`Solver`."""
         q = [c + m for c, m in zip(self._centers, dots, strict=True)]
         start = flat_pose(q, self._beams, self._xp)
-        found = fit(self._model, start, q, variances, self._xp)
-        dx, dy, theta = found.parameters
-        return answer(found, (dx, dy, theta, -self._slope * dy, self._slope * dx), found.covariance)
+        minimum = fit(self._model, start, q, variances, self._xp)
+        dx, dy, theta = minimum.parameters
+        return answer(minimum, (dx, dy, theta, -self._slope * dy, self._slope * dx), minimum.covariance)
 
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta = x

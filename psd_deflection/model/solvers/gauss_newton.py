@@ -33,8 +33,8 @@ class Minimum(NamedTuple):
     steps: int
 
 
-def answer(found: Minimum, pose: Sequence[float], covariance: Sequence[Sequence[float]]) -> Solution:
-    """``found`` as a solver answers: ``pose`` (dX, dY, theta, phi, omega), ``covariance`` of the first three."""
+def answer(minimum: Minimum, pose: Sequence[float], covariance: Sequence[Sequence[float]]) -> Solution:
+    """``minimum`` as a solver answers: ``pose`` (dX, dY, theta, phi, omega), ``covariance`` of the first three."""
     dx, dy, theta, phi, omega = pose
     (vxx, vxy, vxt), (_, vyy, vyt), (_, _, vtt) = (row[:3] for row in covariance[:3])
     return Solution(
@@ -44,9 +44,9 @@ def answer(found: Minimum, pose: Sequence[float], covariance: Sequence[Sequence[
         phi,
         omega,
         (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt),
-        tuple(found.residual),
-        SolverStatus.OK if found.converged else SolverStatus.NOT_CONVERGED,
-        found.steps,
+        tuple(minimum.residual),
+        SolverStatus.OK if minimum.converged else SolverStatus.NOT_CONVERGED,
+        minimum.steps,
     )
 
 

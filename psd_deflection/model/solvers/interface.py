@@ -122,8 +122,8 @@ class Solver(abc.ABC):
 
     def __init_subclass__(cls) -> None:
         # A method derived from another one that changes the answer of one block changes that of many.
-        for one, many in (('solve', 'solve_many'), ('gain', 'gain_many')):
-            if one in vars(cls) and many not in vars(cls):
+        for single, many in (('solve', 'solve_many'), ('gain', 'gain_many')):
+            if single in vars(cls) and many not in vars(cls):
                 setattr(cls, many, getattr(Solver, many))
 
     @abc.abstractmethod
@@ -150,13 +150,13 @@ class Solver(abc.ABC):
         """
         m = np.atleast_2d(np.asarray(dots, dtype=np.float64))
         v = np.broadcast_to(checked_variances(variances), m.shape)
-        found = [self.solve(tuple(a), tuple(b)) for a, b in zip(m.tolist(), v.tolist(), strict=True)]
+        solutions = [self.solve(tuple(a), tuple(b)) for a, b in zip(m.tolist(), v.tolist(), strict=True)]
         return Solutions(
-            np.array([f[:3] for f in found]),
-            np.array([f[3:5] for f in found]),
-            np.array([f.covariance for f in found]).reshape(-1, 3, 3),
-            np.array([f.residual for f in found]),
-            np.array([f.status for f in found], dtype=np.int8),
+            np.array([f[:3] for f in solutions]),
+            np.array([f[3:5] for f in solutions]),
+            np.array([f.covariance for f in solutions]).reshape(-1, 3, 3),
+            np.array([f.residual for f in solutions]),
+            np.array([f.status for f in solutions], dtype=np.int8),
         )
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
@@ -176,7 +176,7 @@ class Solver(abc.ABC):
     def gain_many(self, dots: FloatArray, variances: tuple[float, ...], solutions: Solutions) -> FloatArray:
         """:meth:`gain` (n, 3, 2P) of n blocks: ``dots`` (n, 2P) m, ``variances`` (2P,) m^2 of all of them."""
         rows = zip(dots.tolist(), solutions.rows(), strict=True)
-        return np.stack([self.gain(tuple(own), variances, solution) for own, solution in rows])
+        return np.stack([self.gain(tuple(block_dots), variances, solution) for block_dots, solution in rows])
 
     def allowance(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> FloatArray | None:
         """(3, 3): what the covariance of :meth:`solve` holds besides the dots' noise; None if there is nothing."""
@@ -206,20 +206,20 @@ def flat_gain_many(
     """:meth:`Solver.gain_many`, as :func:`flat_gain`."""
     points = [center + column for center, column in zip(centers, dots.T, strict=True)]
     theta = solutions.pose[:, 2]
-    turn = arithmetic.cos_many(theta), arithmetic.sin_many(theta)
-    rows = weighted_gain(points, turn, variances, tuple(solutions.covariance.reshape(-1, 9).T))
+    cos_sin = arithmetic.cos_many(theta), arithmetic.sin_many(theta)
+    rows = weighted_gain(points, cos_sin, variances, tuple(solutions.covariance.reshape(-1, 9).T))
     return np.array(rows).transpose(2, 0, 1)
 
 
 def weighted_gain(
-    points: Sequence[Number], turn: tuple[Number, Number], variances: Sequence[float], covariance: Sequence[Number]
+    points: Sequence[Number], cos_sin: tuple[Number, Number], variances: Sequence[float], covariance: Sequence[Number]
 ) -> tuple[list[Number], list[Number], list[Number]]:
     """P A^T V^-1, P the answer's own ``covariance``: the gain of least squares with the weights 1/``variances``.
 
-    Rows of dX, dY, theta, of one block or of arrays of blocks. ``points``: q = (x1, y1, ...), m. ``turn``: cosine and
-    sine of theta. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
+    Rows of dX, dY, theta, of one block or of arrays of blocks. ``points``: q = (x1, y1, ...), m. ``cos_sin``: of
+    theta. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
     """
-    c, s = turn
+    c, s = cos_sin
     xx, xy, xt, _, yy, yt, _, _, tt = covariance
     rows: tuple[list[Number], list[Number], list[Number]] = ([], [], [])
     for i in range(0, len(points), 2):

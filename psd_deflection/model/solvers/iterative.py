@@ -157,8 +157,8 @@ class IterativeSolver(Solver):
         gx, gy = s * mx + c * my, s * my - c * mx
         rows: tuple[list[Number], list[Number], list[Number]] = ([], [], [])
         for _, _, lx, ly in plate:
-            for ax, ay, turn in ((-c, -s, c * ly - s * lx), (s, -c, -c * lx - s * ly)):
-                theta = turn / agreement
+            for ax, ay, lever in ((-c, -s, c * ly - s * lx), (s, -c, -c * lx - s * ly)):
+                theta = lever / agreement
                 rows[0].append(ax / count + gx * theta)
                 rows[1].append(ay / count + gy * theta)
                 rows[2].append(theta)

@@ -144,15 +144,15 @@ class MinimumTiltSolver(Solver):
         lever = reach / long
         side = cos_beta * off / long
         # Of psi, by the length of the base line on the plate.
-        turn = 0.0
+        psi_slope = 0.0
         if self._rotation:
             leaning = (1.0 - cos_beta * cos_beta) * self._ey * self._ey
-            turn = -cos_beta / long * self._ex * self._ey / (1.0 - leaning)
+            psi_slope = -cos_beta / long * self._ex * self._ey / (1.0 - leaning)
         ee = en = et = nn = nt = tt = 0.0
         for i, (e_along, e_across, n_across, t_along, t_across) in enumerate(
             (
-                (-cos_beta * (1.0 - lever), -side, lever - 1.0, turn, -1.0 / long),
-                (-cos_beta * lever, side, -lever, -turn, 1.0 / long),
+                (-cos_beta * (1.0 - lever), -side, lever - 1.0, psi_slope, -1.0 / long),
+                (-cos_beta * lever, side, -lever, -psi_slope, 1.0 / long),
             )
         ):
             vx = variances[2 * i]

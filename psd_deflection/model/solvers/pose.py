@@ -63,8 +63,8 @@ class PoseSolver(Solver):
         """One block. See :class:`Solver`."""
         points = np.asarray(dots).reshape(-1, 2) + self._centers
         start = flat_poses(points, self._beams, self._xp).tolist()
-        found = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances, self._xp)
-        return answer(found, found.parameters, found.covariance)
+        minimum = fit(self._model, [*start, 0.0, 0.0], points.ravel().tolist(), variances, self._xp)
+        return answer(minimum, minimum.parameters, minimum.covariance)
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:
         """(J^T W J)^-1 J^T W at the answer. See :class:`Solver`."""

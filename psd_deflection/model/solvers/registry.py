@@ -48,8 +48,8 @@ def solver_class(name: str) -> type[Solver]:
     if entry is None:
         raise ConfigError(f'solver = {name!r}: must be one of {", ".join(SOLVERS)}{did_you_mean(name, SOLVERS)}')
     module, _, attribute = entry.path.partition(':')
-    found: type[Solver] = getattr(importlib.import_module(module), attribute)
-    return found
+    solver_type: type[Solver] = getattr(importlib.import_module(module), attribute)
+    return solver_type
 
 
 def make_solver(name: str, geometry: Geometry, **options: Any) -> Solver:
@@ -75,16 +75,16 @@ def check_arrangement(rig: Rig) -> None:
     """Raise ConfigError if solvers or heights of the rig contradict where its PSDs are."""
     config = rig.estimator
     at = 'base' if rig.psds_at_base else 'tip'
-    others = [name for name in (config.solver, *config.solvers) if solver_class(name).psds_at != at]
-    if config.solver in others:
+    misplaced = [name for name in (config.solver, *config.solvers) if solver_class(name).psds_at != at]
+    if config.solver in misplaced:
         name = BASE_SOLVER if rig.psds_at_base else BY_NAME['solver'].default
         raise ConfigError(
             f'arrangement = {config.arrangement!r}: solver = {config.solver!r} takes PSDs at the '
             f'{solver_class(config.solver).psds_at}: set solver: {name} and solvers: [{name}]'
         )
-    if others:
+    if misplaced:
         raise ConfigError(
-            f'solver = {config.solver!r} has the PSDs at the {at}; {", ".join(others)} of solvers have not: '
+            f'solver = {config.solver!r} has the PSDs at the {at}; {", ".join(misplaced)} of solvers have not: '
             f'set solvers: [{config.solver}]'
         )
     if at == 'base' and config.degraded != 'none':

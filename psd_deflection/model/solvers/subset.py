@@ -39,12 +39,12 @@ class PoseOfFew(Solver):
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block. See :class:`Solver`."""
-        found, end = self._middle.solve(dots, variances), self._end.solve(dots, variances)
+        middle, end = self._middle.solve(dots, variances), self._end.solve(dots, variances)
         if end.status is not SolverStatus.OK:
             return end
-        unknown = self.unknown(found, end)
-        covariance = np.add(np.reshape(found.covariance, (3, 3)), unknown[:, None] * unknown)
-        return found._replace(covariance=tuple(covariance.ravel().tolist()))
+        unknown = self.unknown(middle, end)
+        covariance = np.add(np.reshape(middle.covariance, (3, 3)), unknown[:, None] * unknown)
+        return middle._replace(covariance=tuple(covariance.ravel().tolist()))
 
     @staticmethod
     def unknown(middle: Solution, end: Solution) -> FloatArray:
@@ -61,16 +61,16 @@ class PoseOfFew(Solver):
         return self._middle.gain(dots, variances, self._middle.solve(dots, variances))
 
 
-def geometry_of(rig: Rig, kept: Sequence[int]) -> Geometry:
-    """The geometry of the PSDs ``kept`` (from 0)."""
+def geometry_of(rig: Rig, psds: Sequence[int]) -> Geometry:
+    """The geometry of ``psds`` (from 0)."""
     full = Geometry.from_rig(rig)
-    at = list(kept)
+    at = list(psds)
     return replace(full, centers=full.centers[at], zeros=full.zeros[at], heights=full.heights[at])
 
 
-def subset_solver(name: str, rig: Rig, kept: Sequence[int]) -> Solver | None:
-    """The method ``name`` for the PSDs ``kept`` (from 0), with the rig's options; None if it cannot do with them."""
-    geometry = geometry_of(rig, kept)
+def subset_solver(name: str, rig: Rig, psds: Sequence[int]) -> Solver | None:
+    """The method ``name`` for ``psds`` (from 0), with the rig's options; None if it cannot do with them."""
+    geometry = geometry_of(rig, psds)
     try:
         return make_solver(name, geometry, **solver_class(name).options_from_rig(rig))
     except SolverError:

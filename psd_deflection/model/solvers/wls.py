@@ -110,20 +110,20 @@ class WlsSolver(Solver):
         shift_x = shift_y = moment = 0.0 * dots[0]
         terms = []
         for i, ((lx, ly, x0, y0), (wx, wy)) in enumerate(zip(self._rows, known.weights, strict=True)):
-            bx = dots[2 * i] - x0
-            by = dots[2 * i + 1] - y0
-            shift_x = shift_x + wx * bx
-            shift_y = shift_y + wy * by
-            terms.append((bx, by, lx, ly))
-        for (bx, by, _, _), (wx_ty, wy_tx) in zip(terms, known.levers, strict=True):
-            moment = moment + (wx_ty * bx - wy_tx * by)
+            x = dots[2 * i] - x0
+            y = dots[2 * i + 1] - y0
+            shift_x = shift_x + wx * x
+            shift_y = shift_y + wy * y
+            terms.append((x, y, lx, ly))
+        for (x, y, _, _), (wx_ty, wy_tx) in zip(terms, known.levers, strict=True):
+            moment = moment + (wx_ty * x - wy_tx * y)
         theta = moment * known.variance
         dx = known.mean_y * theta - shift_x / known.sum_x
         dy = -known.mean_x * theta - shift_y / known.sum_y
         residual: list[Number] = []
-        for bx, by, lx, ly in terms:
-            residual.append(bx + dx - ly * theta)
-            residual.append(by + dy + lx * theta)
+        for x, y, lx, ly in terms:
+            residual.append(x + dx - ly * theta)
+            residual.append(y + dy + lx * theta)
         return (dx, dy, theta), residual
 
     def gain(self, dots: tuple[float, ...], variances: tuple[float, ...], solution: Solution) -> FloatArray:

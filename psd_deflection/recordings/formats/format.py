@@ -106,10 +106,10 @@ def formats() -> Iterator[Format]:
     yield from map(find_format, FORMATS)
     for point in sorted(entry_points(group=GROUP), key=lambda e: e.name):
         at = f'format {point.name!r}: {point.value}'
-        found: object = loaded(f'{at} cannot be loaded', point.load)
-        if not isinstance(found, Format):
-            raise ConfigError(f'{at}: {found!r} is no psd_deflection.recordings.formats.format.Format')
-        yield found
+        plug_in: object = loaded(f'{at} cannot be loaded', point.load)
+        if not isinstance(plug_in, Format):
+            raise ConfigError(f'{at}: {plug_in!r} is no psd_deflection.recordings.formats.format.Format')
+        yield plug_in
 
 
 def format_of_name(path: str | Path) -> Format:

@@ -154,7 +154,7 @@ class BagRecording(Recording):
     def warnings(self) -> Sequence[str]:
         """Faults that did not stop the reading, one a line: the bag's, those of ``Recording.warn``, each file's."""
         file_warnings = (line for source in self._sources for line in source.warnings)
-        return [*self._bag_warnings.lines(), *self._found.lines(), *file_warnings]
+        return [*self._bag_warnings.lines(), *self._later_warnings.lines(), *file_warnings]
 
     def _add_warning(self, text: str) -> None:
         self._bag_warnings.add(f'{self.path}: {text}')

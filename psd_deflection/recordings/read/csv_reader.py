@@ -292,9 +292,9 @@ class CsvRecording(Recording):
             raise self._reject(f'holds {len(times)} samples; a recording has at least 2')
         steps = np.diff(np.array(times, dtype=np.int64)).astype(np.float64)
         median = float(np.median(steps))
-        near = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
+        typical = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
         # If the steps differ very much, the median may be close to none of them.
-        step = float(near.mean()) if len(near) else float(steps.min())
+        step = float(typical.mean()) if len(typical) else float(steps.min())
         if why := why_rate(self.path, self._columns['t'], 1e9 / step, times[0] / 1e9):
             raise self._reject(why)
         return step
@@ -348,9 +348,9 @@ class CsvRecording(Recording):
     def topics(self) -> dict[str, int]:
         """Number of messages by topic, as in a bag of the same samples."""
         counts = {SAMPLES: sum(1 for _ in self.blocks())}
-        for topic, found in ((LOAD, self.loads()), (REFERENCE, self.references()), (TEMPERATURE, self.temperatures())):
-            if found:
-                counts[topic] = len(found)
+        for topic, rows in ((LOAD, self.loads()), (REFERENCE, self.references()), (TEMPERATURE, self.temperatures())):
+            if rows:
+                counts[topic] = len(rows)
         return counts
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:

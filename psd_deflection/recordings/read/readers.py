@@ -49,9 +49,9 @@ def _open(path: Path, options: ReadOptions) -> Recording:
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
     if form is None or form.read is None:
-        *others, last = reversed([f.help for f in formats() if f.read is not None])
+        *kinds, last = reversed([f.help for f in formats() if f.read is not None])
         raise RecordingError(
-            f'{path}: is no recording: {", ".join(others)} or {last} is read{what_of_file(path, head_of(path))}'
+            f'{path}: is no recording: {", ".join(kinds)} or {last} is read{what_of_file(path, head_of(path))}'
         )
     return form.read(path, options)
 

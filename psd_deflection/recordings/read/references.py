@@ -70,27 +70,27 @@ class TrustedSamples:
 
 def references_of(recording: Recording) -> References:
     """The references in the recording; raises RecordingError if it has none."""
-    found = references_in(recording)
-    if found is None:
+    references = references_in(recording)
+    if references is None:
         raise RecordingError(
             f'{recording.path}: holds no reference (CSV columns ref_dx, ref_dy, ref_theta, or the topic '
             f'/reference/deflection); give one with --reference FILE'
         )
-    return found
+    return references
 
 
 def references_in(recording: Recording) -> References | None:
     """The references in the recording, with the standard deviations that came with each; None if it has none."""
     stated = recording.references_with_covariance()
-    found = recording.references() or [ReferencePose(r.t_ns, r.dx, r.dy, r.theta) for r in stated]
-    if not found:
+    poses = recording.references() or [ReferencePose(r.t_ns, r.dx, r.dy, r.theta) for r in stated]
+    if not poses:
         return None
     variances = {r.t_ns: (r.covariance[0], r.covariance[4], r.covariance[8]) for r in stated}
-    own = np.array([variances.get(r.t_ns, (0.0, 0.0, 0.0)) for r in found])
+    variance_rows = np.array([variances.get(r.t_ns, (0.0, 0.0, 0.0)) for r in poses])
     # ROS states an unknown covariance as zeros.
-    sd = np.sqrt(own) if np.all(own > 0.0) else None
-    t_ns = np.array([r.t_ns for r in found], dtype=np.int64)
-    return _in_order(t_ns, np.array([r[1:] for r in found]), sd, {})
+    sd = np.sqrt(variance_rows) if np.all(variance_rows > 0.0) else None
+    t_ns = np.array([r.t_ns for r in poses], dtype=np.int64)
+    return _in_order(t_ns, np.array([r[1:] for r in poses]), sd, {})
 
 
 def read_references(path: str | Path) -> References:

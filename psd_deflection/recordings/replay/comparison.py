@@ -305,9 +305,9 @@ def agree(a: object, b: object, least: float) -> bool:
         if set(a) != set(b):
             return False
         numbers = [name for name in a if isinstance(a[name], float) and isinstance(b[name], float)]
-        others = [name for name in a if name not in numbers]
+        rest = [name for name in a if name not in numbers]
         return _group([a[name] for name in numbers], [b[name] for name in numbers], least) and all(
-            _covariance(a[name], b[name]) if name == 'covariance' else agree(a[name], b[name], least) for name in others
+            _covariance(a[name], b[name]) if name == 'covariance' else agree(a[name], b[name], least) for name in rest
         )
     if isinstance(a, float) and isinstance(b, float):
         return _group([a], [b], least)
@@ -327,5 +327,5 @@ def _covariance(a: object, b: object) -> bool:
     if first.shape != second.shape or size * size != first.size:
         return False
     sd = np.sqrt(np.abs(np.diag(first.reshape(size, size))))
-    near = np.abs(first - second).reshape(size, size) <= ROUNDING * sd[:, None] * sd
-    return bool((near.ravel() | (first == second) | (np.isnan(first) & np.isnan(second))).all())
+    close = np.abs(first - second).reshape(size, size) <= ROUNDING * sd[:, None] * sd
+    return bool((close.ravel() | (first == second) | (np.isnan(first) & np.isnan(second))).all())

@@ -260,7 +260,7 @@ def _with_memory(recording: Recording, first: int, changes: list[ParameterChange
         before = [change for change in changes if change.block < memory.block]
         return [*before, memory, *changes[len(before) :]]
     reported = () if recording.recorded_by_us else (*recording.memories[:1], *recording.changes[:1])
-    if any(0 < one.block < first for one in reported):
+    if any(0 < change.block < first for change in reported):
         recording.warn(
             f'{recording.path}: starts in mid-run, and ends before the pipeline said what it remembers (it does every '
             '10 s): the estimates may differ from the recorded ones'
@@ -286,14 +286,14 @@ class BufferedEstimates:
     """The primary estimates and tip loads among the records of a replay."""
 
     def __init__(self) -> None:
-        self._found: list[DeflectionEstimate] = []
+        self._estimates: list[DeflectionEstimate] = []
         self._wrenches: dict[int, TipLoad] = {}
         self._start_ns: int | None = None
 
     def add(self, record: Record) -> None:
         """Take one record."""
         if isinstance(record, DeflectionEstimate) and record.primary:
-            self._found.append(record)
+            self._estimates.append(record)
         elif isinstance(record, TipLoad):
             self._wrenches[record.t_ns] = record
         elif isinstance(record, SampleBlock) and self._start_ns is None:
@@ -301,16 +301,16 @@ class BufferedEstimates:
 
     def series(self) -> EstimateSeries:
         """All of them so far."""
-        found = self._found
+        estimates = self._estimates
         nothing = TipLoad(0, np.nan, np.nan, np.nan)
         return EstimateSeries(
             DEFLECTION,
-            np.array([e.t_ns for e in found], dtype=np.int64),
-            np.array([e.pose for e in found], dtype=np.float64).reshape(-1, 3),
-            np.array([(e.phi, e.omega) for e in found], dtype=np.float64).reshape(-1, 2),
-            np.array([e.covariance for e in found], dtype=np.float64).reshape(-1, 3, 3),
-            np.array([self._wrenches.get(e.t_ns, nothing)[1:] for e in found], dtype=np.float64).reshape(-1, 3),
-            np.array([e.chi_square for e in found], dtype=np.float64),
+            np.array([e.t_ns for e in estimates], dtype=np.int64),
+            np.array([e.pose for e in estimates], dtype=np.float64).reshape(-1, 3),
+            np.array([(e.phi, e.omega) for e in estimates], dtype=np.float64).reshape(-1, 2),
+            np.array([e.covariance for e in estimates], dtype=np.float64).reshape(-1, 3, 3),
+            np.array([self._wrenches.get(e.t_ns, nothing)[1:] for e in estimates], dtype=np.float64).reshape(-1, 3),
+            np.array([e.chi_square for e in estimates], dtype=np.float64),
             self._start_ns,
         )
 

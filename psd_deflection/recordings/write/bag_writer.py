@@ -175,10 +175,10 @@ class McapFile(_RecordSink):
 
     def _abandon(self) -> None:
         stream, self._stream = self._stream, None
-        for one in (stream, self._spool):
-            if one is not None:
+        for file in (stream, self._spool):
+            if file is not None:
                 with contextlib.suppress(OSError):
-                    one.close()
+                    file.close()
 
     def _change(self, change: ParameterChange) -> None:
         if self._stream is None:

@@ -187,8 +187,8 @@ class RerunFile:
             dx, dy, theta = values.reshape(-1, 3).T
             nothing = np.zeros_like(theta)
             at = np.stack([dx, dy, np.full_like(dx, rig.link.length)], axis=-1)
-            turn = np.stack([nothing, nothing, np.sin(theta / 2.0), np.cos(theta / 2.0)], axis=-1)
-            return rr.Transform3D.columns(translation=at, quaternion=turn), 1
+            quaternion = np.stack([nothing, nothing, np.sin(theta / 2.0), np.cos(theta / 2.0)], axis=-1)
+            return rr.Transform3D.columns(translation=at, quaternion=quaternion), 1
         if path == 'rig/tip/plate':
             centers, sizes = zip(*tip_boxes(rig), strict=True)
             halves = [[side / 2.0 for side in size] for size in sizes]
@@ -279,11 +279,11 @@ def blueprint(rig: Rig, speed: float = 1.0) -> Any:
         ),
         line_grid=False,
     )
-    left = rrb.Vertical(
+    left_column = rrb.Vertical(
         *(traces(f'tip/{name}', f'{label} ({unit}), ± 2 sd') for name, label, unit, _, _ in POSE), row_shares=[5, 5, 6]
     )
     detectors = [detector(n) for n in range(1, len(rig.psds) + 1)]
-    right = rrb.Vertical(
+    right_column = rrb.Vertical(
         rrb.Horizontal(*detectors, space, column_shares=[*[3] * len(detectors), 4]),
         traces('load', 'Load at the tip (N, N m)', True),
         traces('sums', 'Sums (V)', True, 1.1 * rig.amplifier.sum_nominal),
@@ -291,7 +291,7 @@ def blueprint(rig: Rig, speed: float = 1.0) -> Any:
         row_shares=[10, 10, 7, 5],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[1, 1]),
+        rrb.Horizontal(left_column, right_column, column_shares=[1, 1]),
         rrb.TimePanel(
             state='collapsed', timeline=TIMELINE, play_state='playing', playback_speed=speed, loop_mode='all'
         ),

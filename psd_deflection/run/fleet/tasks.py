@@ -77,7 +77,7 @@ class _Processes:
 
     def __init__(self, count: int) -> None:
         self.slots = count
-        self._others = set(multiprocessing.active_children())
+        self._previous = set(multiprocessing.active_children())
         self._pool = self._made()
 
     def _made(self) -> ProcessPoolExecutor:
@@ -104,7 +104,7 @@ class _Processes:
 
     def kill(self) -> None:
         """End the processes at once."""
-        for process in set(multiprocessing.active_children()) - self._others:
+        for process in set(multiprocessing.active_children()) - self._previous:
             process.terminate()
         self._pool.shutdown(cancel_futures=True)
 
@@ -239,21 +239,21 @@ class _Run(Generic[T]):
         self._ready: dict[int, Outcome[T]] = {}  # Bound: the slots of the engine.
 
     def outcomes(self) -> Iterator[Outcome[T]]:
-        for turn in range(len(self._names)):
-            while turn not in self._ready:
+        for index in range(len(self._names)):
+            while index not in self._ready:
                 if self._to_retry:
                     self._try_alone(self._to_retry.popleft())
                 else:
-                    self._fill(turn)
+                    self._fill(index)
                     self._gather()
-            yield self._ready.pop(turn)
+            yield self._ready.pop(index)
 
     def _submit(self, i: int) -> Future[Outcome[T]]:
         return self._engine.submit(attempt, self._work, self._names[i], __version__)
 
-    def _fill(self, turn: int) -> None:
+    def _fill(self, index: int) -> None:
         slots = self._engine.slots
-        while self._waiting and len(self._under_way) < slots and self._waiting[0] < turn + slots + AHEAD:
+        while self._waiting and len(self._under_way) < slots and self._waiting[0] < index + slots + AHEAD:
             try:
                 self._under_way[self._submit(self._waiting[0])] = self._waiting[0]
             except BrokenExecutor:
@@ -326,10 +326,10 @@ def listed(words: Sequence[str]) -> list[str]:
 
     Raises RecordingError if a list cannot be read or a pattern matches nothing.
     """
-    found: list[str] = []
+    paths: list[str] = []
     for word in words:
-        found += _of_list(Path(word)) if _is_list(Path(word)) else _of_word(word)
-    return list(dict.fromkeys(found))
+        paths += _of_list(Path(word)) if _is_list(Path(word)) else _of_word(word)
+    return list(dict.fromkeys(paths))
 
 
 def _is_list(path: Path) -> bool:
@@ -347,10 +347,10 @@ def _of_word(word: str) -> list[str]:
     folders = {path for path in matches if path.is_dir() and _is_bag(path)}
     endings = endings_of_recordings()
     files = (p for p in matches if p.suffix.lower() in endings and p.is_file() and p.parent not in folders)
-    found = [str(path) for path in sorted([*folders, *files])]
-    if not found:
+    paths = [str(path) for path in sorted([*folders, *files])]
+    if not paths:
         raise RecordingError(f'{word}: matches no recording (bag folders, {", ".join(endings)})')
-    return found
+    return paths
 
 
 def _is_bag(folder: Path) -> bool:

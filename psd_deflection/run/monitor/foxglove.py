@@ -163,8 +163,8 @@ class FoxgloveServer(GatedServer):
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
             asked = json.loads(message.data)
             if asked['op'] == 'subscribe':
-                for one in asked['subscriptions']:
-                    self._subscribe(viewer, one['channelId'], one['id'])
+                for subscription in asked['subscriptions']:
+                    self._subscribe(viewer, subscription['channelId'], subscription['id'])
             elif asked['op'] == 'unsubscribe':
                 gone = frozenset(asked['subscriptionIds'])
                 for channel in [c for c, s in viewer.subscriptions.items() if s in gone]:

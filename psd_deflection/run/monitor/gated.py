@@ -27,8 +27,8 @@ _HOST = re.compile(r'(?:\[([0-9a-f:.]+(?:%[a-z0-9._-]+)?)\]|([a-z0-9._-]+))(?::[
 
 def host_name(host_header: str) -> str:
     """The name in a Host header, without port and brackets, lower case; '' if it is malformed."""
-    found = _HOST.fullmatch(host_header.lower())
-    return (found[1] or found[2]).rstrip('.') if found is not None else ''
+    match = _HOST.fullmatch(host_header.lower())
+    return (match[1] or match[2]).rstrip('.') if match is not None else ''
 
 
 def is_address(name: str) -> bool:
@@ -61,8 +61,8 @@ def is_own_host(host_header: str, address: str) -> bool:
         return False
     if is_loopback(address):
         return is_loopback(name)
-    own = socket.gethostname().lower()
-    return is_address(name) or name in ('localhost', address.lower(), own, own + '.local')
+    hostname = socket.gethostname().lower()
+    return is_address(name) or name in ('localhost', address.lower(), hostname, hostname + '.local')
 
 
 def is_own_page(headers: Mapping[str, str]) -> bool:
@@ -245,8 +245,8 @@ class GatedServer(abc.ABC):
     async def _bound_connections(self, runner: web.AppRunner) -> None:
         while True:
             if runner.server is not None:
-                others = [c for c in runner.server.connections if c not in self._looked_through]
-                for oldest in others[:-CONNECTIONS]:
+                pending = [c for c in runner.server.connections if c not in self._looked_through]
+                for oldest in pending[:-CONNECTIONS]:
                     oldest.force_close()
             await asyncio.sleep(LOOK_S)
 

@@ -144,8 +144,8 @@ class Ring:
         if first >= last:
             return self.cells[:0]
         keys = np.arange(first, last, dtype=np.int64)
-        found: Cells = self.cells[keys % self.length]
-        there: Cells = found[found['key'] == keys]
+        cells: Cells = self.cells[keys % self.length]
+        there: Cells = cells[cells['key'] == keys]
         return there
 
     @property
@@ -185,8 +185,8 @@ class History:
     @property
     def kept_length(self) -> int:
         """So many cells of the kept level reach as far back as the coarsest level."""
-        kept, last = self.rings[KEPT_LEVEL], self.rings[-1]
-        return last.length * (last.width_ns // kept.width_ns)
+        ring, last = self.rings[KEPT_LEVEL], self.rings[-1]
+        return last.length * (last.width_ns // ring.width_ns)
 
     def unsaved(self, since_key: int | None = None) -> Kept:
         """What is new or changed since the last call: what was kept from ``from_key`` on is to be replaced by it.
@@ -208,8 +208,8 @@ class History:
 
     def load(self, saved: Kept) -> None:
         """Take what an earlier run kept: it is before what has come since, or in the same cell."""
-        own = self.rings[KEPT_LEVEL].cells['key']
-        ends = [int(keys.min()) for keys in (own[own != _NONE], saved.cells['key'][-1:]) if len(keys)]
+        current_keys = self.rings[KEPT_LEVEL].cells['key']
+        ends = [int(keys.min()) for keys in (current_keys[current_keys != _NONE], saved.cells['key'][-1:]) if len(keys)]
         self._unsaved_from = min(ends, default=0)
         for ring in self.rings[KEPT_LEVEL:]:
             ring.put(_merged(saved.cells, ring.width_ns // self.rings[KEPT_LEVEL].width_ns))
@@ -327,10 +327,10 @@ class History:
             scale = ring.width_ns // finest.width_ns
             for cell in finest.between(key * scale, (key + 1) * scale):
                 ring.merge(cell, int(cell['key']) * finest.width_ns)
-        kept = [mark for mark in self.marks if mark[0] < t_ns]
+        earlier = [mark for mark in self.marks if mark[0] < t_ns]
         self._new_marks = True
         self.marks.clear()
-        self.marks.extend(kept)
+        self.marks.extend(earlier)
 
 
 def _merged(cells: Cells, scale: int) -> Cells:

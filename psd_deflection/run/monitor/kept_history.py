@@ -107,28 +107,28 @@ class HistoryFile:
 
     def load(self, until_key: int, until_ns: int) -> Kept:
         """What was kept, without what lies after now: the clock was set back since."""
-        found = self._file.execute(
+        rows = self._file.execute(
             'SELECT key, cell FROM cells WHERE key <= ? ORDER BY key DESC LIMIT ?', (until_key, self._length)
         ).fetchall()
         size = self._kind.itemsize
-        good = [(key, cell) for key, cell in reversed(found) if isinstance(cell, bytes) and len(cell) == size]
+        good = [(key, cell) for key, cell in reversed(rows) if isinstance(cell, bytes) and len(cell) == size]
         cells = np.frombuffer(b''.join(cell for _, cell in good), self._kind)
         right = cells['key'] == np.array([key for key, _ in good], np.int64)
         cells = cells[right & (cells['count'] <= cells['blocks'][:, None]).all(axis=1)]
         marks = self._file.execute('SELECT t_ns, content FROM marks WHERE t_ns <= ?', (until_ns,)).fetchmany(MOST_MARKS)
         return Kept(0, cells, [(t_ns, text) for t_ns, text in marks if isinstance(t_ns, int) and _is_mark(text)])
 
-    def save(self, kept: Kept) -> None:
-        """Replace what is there from ``kept.from_key`` on, and the marks if there are new ones; drop the oldest."""
-        rows = [(int(cell['key']), cell.tobytes()) for cell in kept.cells]
+    def save(self, unsaved: Kept) -> None:
+        """Replace what is there from ``unsaved.from_key`` on, and the marks if there are new ones; drop the oldest."""
+        rows = [(int(cell['key']), cell.tobytes()) for cell in unsaved.cells]
         with self._transaction():
-            self._file.execute('DELETE FROM cells WHERE key >= ?', (kept.from_key,))
+            self._file.execute('DELETE FROM cells WHERE key >= ?', (unsaved.from_key,))
             self._file.executemany('INSERT OR REPLACE INTO cells VALUES (?, ?)', rows)
             if rows:
                 self._file.execute('DELETE FROM cells WHERE key <= ?', (rows[-1][0] - self._length,))
-            if kept.marks is not None:
+            if unsaved.marks is not None:
                 self._file.execute('DELETE FROM marks')
-                self._file.executemany('INSERT INTO marks VALUES (?, ?)', kept.marks)
+                self._file.executemany('INSERT INTO marks VALUES (?, ?)', unsaved.marks)
 
     def close(self) -> None:
         """Close the file."""
@@ -178,8 +178,8 @@ class HistoryKeeper:
         """Save what is new, unless the disk still has to do with the last time."""
         if self._restored and self.idle:
             self._idle.clear()
-            kept, self._failed_from = self._history.unsaved(self._failed_from), None
-            self._todo.put_nowait(kept)
+            unsaved, self._failed_from = self._history.unsaved(self._failed_from), None
+            self._todo.put_nowait(unsaved)
 
     @property
     def idle(self) -> bool:
@@ -211,14 +211,14 @@ class HistoryKeeper:
         with contextlib.closing(file):
             while True:
                 self._idle.set()
-                kept = self._todo.get()
-                if kept is None:
+                unsaved = self._todo.get()
+                if unsaved is None:
                     break
                 try:
-                    file.save(kept)
+                    file.save(unsaved)
                     self._reported = False
                 except (sqlite3.Error, OSError) as error:
-                    self._failed_from = kept.from_key
+                    self._failed_from = unsaved.from_key
                     self._fail(error)
 
     def _opened(self) -> tuple[HistoryFile, Kept]:

@@ -70,8 +70,8 @@ def served_pages() -> list[Served]:
 def _read(path: Path) -> Served | None:
     try:
         with path.open('rb') as stream:
-            kept = json.loads(stream.read(MAX_BYTES))
-        page = Served(str(kept['url']), str(kept['token']), str(kept['name']), int(kept['pid']))
+            content = json.loads(stream.read(MAX_BYTES))
+        page = Served(str(content['url']), str(content['token']), str(content['name']), int(content['pid']))
         if os.name == 'posix':
             # Elsewhere 0 is no question but Ctrl-C.
             os.kill(page.pid, 0)
@@ -90,9 +90,9 @@ def need_server() -> None:
             "the live page and Foxglove need aiohttp: `pip install 'psd_deflection[monitor]'` or "
             '`apt install python3-aiohttp`, or run without monitor and foxglove'
         )
-    found = importlib.metadata.version('aiohttp')
-    if tuple(int(n) for n in re.findall(r'\d+', found)[:2]) < (3, 9):
+    installed = importlib.metadata.version('aiohttp')
+    if tuple(int(n) for n in re.findall(r'\d+', installed)[:2]) < (3, 9):
         raise ConfigError(
-            f"the live page needs aiohttp 3.9 or later, {found} is installed: `pip install 'psd_deflection[monitor]'` "
-            'in a virtual environment, or run without monitor'
+            f'the live page needs aiohttp 3.9 or later, {installed} is installed: '
+            "`pip install 'psd_deflection[monitor]'` in a virtual environment, or run without monitor"
         )

@@ -168,7 +168,7 @@ class MonitorServer(GatedServer):
     # Data from the threads of the run.
 
     async def _pump(self) -> None:
-        due = 0.0
+        next_time = 0.0
         while True:
             new = False
             for item in self._feed.take():
@@ -187,8 +187,8 @@ class MonitorServer(GatedServer):
                     self._take_mark(item)
                     new = True
             now = time.monotonic()
-            if self.viewers and now >= due:
-                due = now + SPECTRUM_EVERY_S
+            if self.viewers and now >= next_time:
+                next_time = now + SPECTRUM_EVERY_S
                 self._last_density = self._spectrum.density()
                 self._density = (self._density[0] + 1, density_json(self._last_density))
                 new = True

@@ -95,10 +95,10 @@ def line_entry(rig: Rig, frequencies: FloatArray, density: FloatArray | None) ->
 
     One recording cannot tell a vibration from one that sampling folds to its frequency; the message says what can.
     """
-    found = None if density is None else _line(rig, frequencies, np.nan_to_num(density) ** 2)
-    if found is None:
+    line = None if density is None else _line(rig, frequencies, np.nan_to_num(density) ** 2)
+    if line is None:
         return DiagnosticEntry(NAME, 0, 'no line but those of the modes', ())
-    hz, sizes = found
+    hz, sizes = line
     there = [n for n, size in zip(dot_names(len(rig.psds)), sizes.tolist(), strict=True) if size > 0.3 * sizes.max()]
     rate = rig.converter.sample_rate_hz
     size = 1e6 * sizes.max()

@@ -87,10 +87,10 @@ def _start_foxglove(session: Session, log: LogCallback, views: Views, reports: b
 
 def foxglove() -> Any:
     """The module of the optional server, which needs aiohttp. Raises ConfigError if it is not there."""
-    found = optional('psd_deflection.run.monitor.foxglove')
-    if found is None:
+    module = optional('psd_deflection.run.monitor.foxglove')
+    if module is None:
         raise ConfigError('foxglove = true: this installation has no run/monitor/foxglove.py')
-    return found
+    return module
 
 
 class Reports:

@@ -39,7 +39,7 @@ class Frame:
     ``force`` (3,) at its end, ``others`` (N, 3) at the tips, N in the base.
     """
 
-    def __init__(self, chain: Chain, force: FloatArray, others: FloatArray | None = None) -> None:
+    def __init__(self, chain: Chain, force: FloatArray, inner: FloatArray | None = None) -> None:
         pynite = pytest.importorskip('Pynite', reason='the finite elements: pip install PyNiteFEA')
         self.model = pynite.FEModel3D()
         self.model.add_material('unit', 1.0, 1.0, 0.0, 0.0)
@@ -58,7 +58,7 @@ class Frame:
             ends.append((foot, root, base, link.length))
             at = tip
         end = self._beam(root, at.position, at @ chain.end, RIGID, RIGID)
-        loads = [(end, force)] if others is None else [(end, force), *zip((e[1] for e in ends), others, strict=True)]
+        loads = [(end, force)] if inner is None else [(end, force), *zip((e[1] for e in ends), inner, strict=True)]
         for node, vector in loads:
             for axis, value in zip('XYZ', vector, strict=True):
                 self.model.add_node_load(node, f'F{axis}', float(value))
@@ -91,13 +91,13 @@ class Frame:
         return np.array([d['Combo 1'] for d in (n.DX, n.DY, n.DZ, n.RX, n.RY, n.RZ)])
 
 
-def in_base(found: EndEffector) -> FloatArray:
+def in_base(tip: EndEffector) -> FloatArray:
     """Translation and rotation vector of the end effector, in the base."""
-    return np.concatenate([found.rigid.rotation @ found.vector[:3], found.rigid.rotation @ found.vector[3:]])
+    return np.concatenate([tip.rigid.rotation @ tip.vector[:3], tip.rigid.rotation @ tip.vector[3:]])
 
 
-def assert_agrees(found: EndEffector, truth: FloatArray, share: float) -> None:
-    moved = in_base(found)
+def assert_agrees(tip: EndEffector, truth: FloatArray, share: float) -> None:
+    moved = in_base(tip)
     for part in (slice(0, 3), slice(3, 6)):
         assert np.linalg.norm(moved[part] - truth[part]) < share * np.linalg.norm(truth[part])
 
@@ -114,8 +114,8 @@ def test_point_d_of_appendix_b(link: TwinLink) -> None:
     assert_agrees(chain.compose([TipDeflection(frame.tips[0], CERTAIN)]), frame.end, 0.005)
     # The appendix lets the twist carry D along an arc, as the composed pose does.
     bent = chain.tips_under(np.array([0.0, FORCE, 0.0]))[0]
-    found = chain.compose([TipDeflection(bent, CERTAIN)])
-    assert found.vector[1] == pytest.approx(link.tip_total(FORCE), rel=1e-3)
+    tip = chain.compose([TipDeflection(bent, CERTAIN)])
+    assert tip.vector[1] == pytest.approx(link.tip_total(FORCE), rel=1e-3)
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -133,8 +133,8 @@ def test_slope_ratio_of_force_is_wrong_for_inner_link() -> None:
     rng = np.random.default_rng(0)
     chain = random_chain(rng, 3, 'ratio')
     frame = Frame(chain, np.array([3.0, -4.0, 5.0]))
-    found = in_base(chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips]))
-    error = np.linalg.norm(found[:3] - frame.end[:3]) / np.linalg.norm(frame.end[:3])
+    moved = in_base(chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips]))
+    error = np.linalg.norm(moved[:3] - frame.end[:3]) / np.linalg.norm(frame.end[:3])
     assert 0.03 < error < 0.3
 
 
@@ -156,12 +156,12 @@ def test_covariance_covers_other_forces_than_assumed(slopes: str, share: float) 
     for seed in range(12):
         rng = np.random.default_rng(seed)
         chain = random_chain(rng, 3, slopes)
-        force, others = rng.uniform(-5.0, 5.0, 3), share * rng.uniform(-5.0, 5.0, (3, 3))
-        frame = Frame(chain, force, others)
-        found = chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips])
-        rotated = np.kron(np.eye(2), found.rigid.rotation)
-        deviations = np.sqrt(np.diag(rotated @ found.covariance @ rotated.T))
-        miss = np.abs(in_base(found) - frame.end)
+        force, inner = rng.uniform(-5.0, 5.0, 3), share * rng.uniform(-5.0, 5.0, (3, 3))
+        frame = Frame(chain, force, inner)
+        effector = chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips])
+        rotated = np.kron(np.eye(2), effector.rigid.rotation)
+        deviations = np.sqrt(np.diag(rotated @ effector.covariance @ rotated.T))
+        miss = np.abs(in_base(effector) - frame.end)
         inside.extend(miss < 1.96 * deviations)
         error.append(np.linalg.norm(miss[:3]))
         stated.append(np.linalg.norm(deviations[:3]))
@@ -187,16 +187,16 @@ def test_covariance_is_carried_by_finite_differences(slopes: str) -> None:
         above, below = deflected(change), deflected(-change)
         moved = Transform(above.rotation @ below.rotation.T, above.position - below.position)
         column[:] = np.concatenate([moved.position, moved.rotation_vector]) / (2.0 * h)
-    found = chain.compose([TipDeflection(p, c) for p, c in zip(tips, covariances, strict=True)], angles)
+    effector = chain.compose([TipDeflection(p, c) for p, c in zip(tips, covariances, strict=True)], angles)
     want = sum(slope[:, n : n + 3] @ c @ slope[:, n : n + 3].T for n, c in zip((0, 3, 6), covariances, strict=True))
-    np.testing.assert_allclose(found.covariance - found.of_model, want, rtol=2e-3, atol=1e-12)
+    np.testing.assert_allclose(effector.covariance - effector.of_model, want, rtol=2e-3, atol=1e-12)
 
 
 def test_an_uncertain_slope_ratio_widens_by_its_lever() -> None:
     link = ChainLink('BC', IDENTITY, LinkStatics(0.5, 1500.0, 1000.0), slope_ratio_sd=0.1)
     chain = Chain([link], shift(0.0, 0.0, 0.4))
-    found = chain.compose([TipDeflection(np.array([1e-3, 0.0, 0.0]), CERTAIN)])
-    deviations = np.sqrt(np.diag(found.covariance - found.of_model))
+    effector = chain.compose([TipDeflection(np.array([1e-3, 0.0, 0.0]), CERTAIN)])
+    deviations = np.sqrt(np.diag(effector.covariance - effector.of_model))
     # k dX/L turns the tip about Y, and the end effector is 0.4 m beyond it.
     assert deviations[4] == pytest.approx(0.1 * 1e-3 / 0.5, rel=1e-5)
     assert deviations[0] == pytest.approx(0.4 * deviations[4], rel=1e-4)
@@ -216,9 +216,9 @@ def test_joints_turn_what_follows_them() -> None:
     assert chain.rigid().position == pytest.approx([0.0, 0.0, 1.0])
     assert chain.rigid([0.0, np.pi / 2]).position == pytest.approx([0.5, 0.0, 0.5])
     twisted = [TipDeflection(np.array([0.0, 0.0, 0.01]), CERTAIN), TipDeflection(np.zeros(3), CERTAIN)]
-    found = chain.compose(twisted, [0.0, np.pi / 2])
-    assert in_base(found)[:3] == pytest.approx([0.5 * (np.cos(0.01) - 1), 0.5 * np.sin(0.01), 0.0], abs=1e-12)
-    assert in_base(found)[3:] == pytest.approx([0.0, 0.0, 0.01], abs=1e-12)
+    effector = chain.compose(twisted, [0.0, np.pi / 2])
+    assert in_base(effector)[:3] == pytest.approx([0.5 * (np.cos(0.01) - 1), 0.5 * np.sin(0.01), 0.0], abs=1e-12)
+    assert in_base(effector)[3:] == pytest.approx([0.0, 0.0, 0.01], abs=1e-12)
 
 
 def test_what_is_no_chain_is_rejected() -> None:

@@ -69,8 +69,8 @@ def test_interpolated_motion_widens_covariance() -> None:
 
 def test_lost_block_of_other_link_leaves_gap_beside_it() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
-    kept = [t for t in every(7_000_000, 10) if t != 7_000_000 + 4 * BLOCK_NS]
-    got = run(joiner, {0: every(0, 10), 1: kept})
+    times = [t for t in every(7_000_000, 10) if t != 7_000_000 + 4 * BLOCK_NS]
+    got = run(joiner, {0: every(0, 10), 1: times})
     assert [j.t_ns // BLOCK_NS for j in got if j.missing] == [4, 5]
     assert all(j.missing == (1,) and j.tips == () for j in got if j.missing)
     assert joiner.missing == [0, 2]

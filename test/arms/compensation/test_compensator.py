@@ -494,11 +494,11 @@ def test_motion_before_first_rest_gives_no_slope(period: float, way: Sequence[fl
 )
 def test_one_fit_is_enough_beside_a_right_joint(late: int, slope: float, wrong: int | None) -> None:
     """The second joint moves by ``slope`` of its offset, ``late`` periods after the first by all of its own."""
-    response, found = JointResponse(2), []
+    response, joints = JointResponse(2), []
     for n in range(130):
         offsets = 0.02 * np.clip(np.array([n - 50, n - 50 - late]) / 10, 0.0, 1.0)
-        found.append(response.add(0.02 * n, offsets * (1.0, slope), offsets, 0.01))
-    assert next((joint for joint in found if joint is not None), None) == wrong
+        joints.append(response.add(0.02 * n, offsets * (1.0, slope), offsets, 0.01))
+    assert next((joint for joint in joints if joint is not None), None) == wrong
 
 
 def test_a_fit_of_more_than_a_minute_begins_anew() -> None:
@@ -618,17 +618,17 @@ def test_switch_off_in_silence_returns_offsets_later(arm: Arm) -> None:
     loop.reports = False
     loop.run(0.1)
     loop.compensator.enable(False)
-    left, count = loop.offsets.copy(), len(loop.sent)
-    assert left.any()
+    offsets, count = loop.offsets.copy(), len(loop.sent)
+    assert offsets.any()
     assert loop.run(0.5).state is State.OFF
     assert len(loop.sent) == count
-    assert np.array_equal(loop.offsets, left)
+    assert np.array_equal(loop.offsets, offsets)
     loop.reports = True
     loop.compensator.stop(OTHER_PUBLISHER, other_publisher=True)
     loop.run(0.2)
     assert len(loop.sent) == count
     loop.compensator.stop('')
-    assert loop.run(float(np.abs(left).max()) / 0.1 + 0.1).state is State.OFF
+    assert loop.run(float(np.abs(offsets).max()) / 0.1 + 0.1).state is State.OFF
     assert not loop.offsets.any()
     assert loop.step() <= 1.0 + 1e-9
     count = len(loop.sent)
@@ -956,7 +956,7 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
     now, clock, has = 0.0, 0.0, ELBOW if output == 'commands' else np.zeros(2)
     sent: list[tuple[float, FloatArray]] = []
     good_ones: list[tuple[str, Any]] = [('good', None)] * 3
-    for kind, value in [one for event in events for one in (event, *good_ones)]:
+    for kind, value in [item for event in events for item in (event, *good_ones)]:
         now += 0.02
         late = 0.0
         age, covariance, deflection, joints, applied = 0.0, CERTAIN, shift(1e-3, 0.0, 2e-3), ELBOW, has

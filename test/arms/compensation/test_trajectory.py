@@ -39,32 +39,32 @@ def moved(orders: int, seconds: float = 0.5, to: float = 0.8) -> Trajectory:
     return checked(NAMES, [0.0, 0.5 * seconds, seconds], points)
 
 
-def summed(by: Shaper, path: Trajectory, at: FloatArray) -> FloatArray:
+def summed(impulses: Shaper, path: Trajectory, at: FloatArray) -> FloatArray:
     """The weighted sum itself."""
-    return np.asarray(sum(a * path.at(at - t)[:, 0] for t, a in zip(by.times, by.sizes, strict=True)))
+    return np.asarray(sum(a * path.at(at - t)[:, 0] for t, a in zip(impulses.times, impulses.sizes, strict=True)))
 
 
 @pytest.mark.parametrize('orders', [1, 2, 3])
 @pytest.mark.parametrize('kind', KINDS)
 def test_the_controller_follows_the_sum_exactly(kind: str, orders: int) -> None:
-    by, path = shaper(kind, 12.0, 0.02), moved(orders)
-    shaped = TrajectoryShaper(by).shape(5 * S, path, ZERO)
+    impulses, path = shaper(kind, 12.0, 0.02), moved(orders)
+    shaped = TrajectoryShaper(impulses).shape(5 * S, path, ZERO)
     assert shaped.states.shape[1] == orders
-    assert shaped.duration == pytest.approx(path.duration + by.duration, abs=1e-9)
+    assert shaped.duration == pytest.approx(path.duration + impulses.duration, abs=1e-9)
     assert np.array_equal(shaped.states[0, 0], path.states[0, 0])
     assert np.array_equal(shaped.states[-1, 0], path.states[-1, 0])
     assert np.all(np.diff(shaped.times) > 0.0)
     at = np.linspace(0.0, shaped.duration, 997)
-    np.testing.assert_allclose(shaped.at(at)[:, 0], summed(by, path, at), atol=2e-5)
+    np.testing.assert_allclose(shaped.at(at)[:, 0], summed(impulses, path, at), atol=2e-5)
 
 
 @pytest.mark.parametrize('orders', [1, 2])
 def test_a_smooth_trajectory_has_no_points_close_to_each_other(orders: int) -> None:
     """Only a kink has one just before it: a controller follows few points better than many."""
-    by, path = ZVD, moved(orders)
-    shaped = TrajectoryShaper(by).shape(0, path, ZERO)
+    impulses, path = ZVD, moved(orders)
+    shaped = TrajectoryShaper(impulses).shape(0, path, ZERO)
     assert np.diff(shaped.times).min() > 1e-3
-    assert len(shaped.times) == len(path.times) * len(by.times)
+    assert len(shaped.times) == len(path.times) * len(impulses.times)
 
 
 @settings(max_examples=30, deadline=None)
@@ -81,12 +81,12 @@ def test_positions_and_speeds_stay_within_those_that_were_given(legs: list[tuple
 
 @pytest.mark.parametrize('orders', [1, 2, 3])
 def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
-    by = TrajectoryShaper(ZVD)
-    first = by.shape(0, moved(orders), ZERO)
+    path_shaper = TrajectoryShaper(ZVD)
+    first = path_shaper.shape(0, moved(orders), ZERO)
     now = 0.2
     there = moved(orders).at(np.array([now]))[0]
     back = checked(NAMES, [0.0, 0.4], [[*there, *[[]] * (3 - orders)], [[0.0, 0.0]] * orders + [[]] * (3 - orders)])
-    second = by.shape(round(now * S), back, ZERO)
+    second = path_shaper.shape(round(now * S), back, ZERO)
     # No step where it is replaced, nor later; a step is more than the fastest goes in 2 ms.
     at = np.arange(0.0, second.duration, 0.002)
     full = np.concatenate([first.at(np.arange(0.0, now, 0.002))[:, 0], second.at(at)[:, 0]])
@@ -105,11 +105,11 @@ def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
 
 def test_points_of_twice_replaced_trajectory_are_kept() -> None:
     """Lines with a kink: without a point there the controller would cut the corner."""
-    by = shaper('zvd', 3.0, 0.02)
+    impulses = shaper('zvd', 3.0, 0.02)
     starts = [0.0, 0.2, 0.3]
     # From where the one before is: 0.3 after 0.1 s, then back.
     paths = [([0.0, 0.1, 1.0], [0.0, 0.3, 0.0]), ([0.0, 0.5], [0.0, -0.1]), ([0.0, 0.4], [0.0, 0.2])]
-    shapes = TrajectoryShaper(by, max_step=1.0)
+    shapes = TrajectoryShaper(impulses, max_step=1.0)
     knots: list[tuple[list[float], list[float]]] = []
     for start, (times, places) in zip(starts, paths, strict=True):
         if knots:
@@ -123,40 +123,40 @@ def test_points_of_twice_replaced_trajectory_are_kept() -> None:
         return np.choose(which, [np.interp(t, *k) for k in knots])
 
     at = np.linspace(0.0, shaped.duration, 1501)
-    wanted = sum(a * commanded(starts[-1] + at - t) for t, a in zip(by.times, by.sizes, strict=True))
+    wanted = sum(a * commanded(starts[-1] + at - t) for t, a in zip(impulses.times, impulses.sizes, strict=True))
     np.testing.assert_allclose(shaped.at(at)[:, 0, 0], wanted, atol=1e-6)
     # The kink of the first, 0.1 s after it began, comes back as the last of the shaper's times says.
-    kink = 0.1 + by.times[-1] - starts[-1]
+    kink = 0.1 + impulses.times[-1] - starts[-1]
     assert kink > 0.1
     assert np.abs(shaped.times - kink).min() < 1e-6
 
 
 def test_joints_that_do_not_follow_are_named() -> None:
-    by = TrajectoryShaper(ZVD, max_step=0.05)
-    assert by.joints_fault(0, ZERO) == ''
-    path = by.shape(S, moved(1), ZERO)
+    path_shaper = TrajectoryShaper(ZVD, max_step=0.05)
+    assert path_shaper.joints_fault(0, ZERO) == ''
+    path = path_shaper.shape(S, moved(1), ZERO)
     way = path.at(np.arange(0.0, path.duration, 0.01))[:, 0]
     for i, here in enumerate(way):
         now = S + i * S // 100
         # 0.3 s late is not too late, nor is 0.049 beside the path.
         late = way[max(i - 29, 0)]
         for at in (here, late, here + 0.049, late - 0.049):
-            assert by.joints_fault(now, standing(dict(zip(NAMES, at.tolist(), strict=True)))) == '', i
+            assert path_shaper.joints_fault(now, standing(dict(zip(NAMES, at.tolist(), strict=True)))) == '', i
     end = S + round(S * path.duration)
-    stuck = by.joints_fault(end, ZERO)
+    stuck = path_shaper.joints_fault(end, ZERO)
     assert f'{NAMES[0]} is {path.states[-1, 0, 0]:.3g} rad or m from where' in stuck
-    assert by.joints_fault(end, standing({NAMES[1]: float(path.states[-1, 0, 1])})) == ''
-    by.forget()
-    assert by.joints_fault(end, ZERO) == ''
+    assert path_shaper.joints_fault(end, standing({NAMES[1]: float(path.states[-1, 0, 1])})) == ''
+    path_shaper.forget()
+    assert path_shaper.joints_fault(end, ZERO) == ''
 
 
 def test_a_stream_of_set_points_is_shaped() -> None:
-    by = TrajectoryShaper(ZV, max_step=0.05)
+    path_shaper = TrajectoryShaper(ZV, max_step=0.05)
     period, heard = 0.02, []
     for n in range(60):
         target = [min(0.01 * n, 0.3)]
         point = checked(['a'], [period], [[target, [], []]])
-        shaped = by.shape(round((10.0 + n * period) * S), point, standing({'a': 0.0}))
+        shaped = path_shaper.shape(round((10.0 + n * period) * S), point, standing({'a': 0.0}))
         heard.append(shaped.at(np.array([0.0]))[0, 0, 0])
     # Point n is reached after n + 1 periods.
     wanted = sum(
@@ -167,15 +167,15 @@ def test_a_stream_of_set_points_is_shaped() -> None:
         for t, a in zip(ZV.times, ZV.sizes, strict=True)
     )
     np.testing.assert_allclose(heard, wanted, atol=1e-6)
-    assert len(by.history) < 6
+    assert len(path_shaper.history) < 6
 
 
 def test_it_begins_where_the_joints_are() -> None:
     without_start = checked(NAMES, [0.5], [[[0.8, 0.1], [0.0, 0.0], []]])
-    by = TrajectoryShaper(ZV)
+    path_shaper = TrajectoryShaper(ZV)
     with pytest.raises(ConfigError, match='the position of elbow is not known'):
-        by.shape(0, without_start, standing({'shoulder': 0.3}))
-    shaped = by.shape(0, without_start, standing({'shoulder': 0.3, 'elbow': 0.2, 'wrist': 0.0}))
+        path_shaper.shape(0, without_start, standing({'shoulder': 0.3}))
+    shaped = path_shaper.shape(0, without_start, standing({'shoulder': 0.3, 'elbow': 0.2, 'wrist': 0.0}))
     assert shaped.times[0] == 0.0
     assert shaped.states[0].tolist() == [[0.3, 0.2], [0.0, 0.0]]
     # A joint of which nobody tells anything is not moved, wherever a trajectory says that it is.
@@ -184,35 +184,35 @@ def test_it_begins_where_the_joints_are() -> None:
     # Another arm may not be under way, or elsewhere.
     other = checked(['wrist'], [0.0], [[[0.1], [], []]])
     with pytest.raises(ConfigError, match='other joints are under way: shoulder, elbow'):
-        by.shape(S // 10, other, {})
-    assert by.shape(3 * S, other, standing({'wrist': 0.1})).duration == pytest.approx(ZV.duration)
+        path_shaper.shape(S // 10, other, {})
+    assert path_shaper.shape(3 * S, other, standing({'wrist': 0.1})).duration == pytest.approx(ZV.duration)
     with pytest.raises(ConfigError, match=r'begins 0.4 rad or m from where wrist is, must be at most 0.05'):
         TrajectoryShaper(ZV).shape(0, other, standing({'wrist': 0.5}))
 
 
 def test_a_stop_is_forgotten() -> None:
-    by = TrajectoryShaper(ZVD)
-    by.shape(0, moved(2), ZERO)
-    assert by.moves(round(0.5 * S))
-    assert not by.moves(round((0.5 + ZVD.duration + 0.01) * S))
-    by.forget()
-    assert not by.moves(round(0.1 * S))
-    elsewhere = checked(NAMES, [0.0], [[[2.0, 2.0], [], []]])
-    assert by.shape(round(0.1 * S), elsewhere, standing({'shoulder': 2.0, 'elbow': 2.0})).states[0, 0].tolist() == [
+    path_shaper = TrajectoryShaper(ZVD)
+    path_shaper.shape(0, moved(2), ZERO)
+    assert path_shaper.moves(round(0.5 * S))
+    assert not path_shaper.moves(round((0.5 + ZVD.duration + 0.01) * S))
+    path_shaper.forget()
+    assert not path_shaper.moves(round(0.1 * S))
+    goal = checked(NAMES, [0.0], [[[2.0, 2.0], [], []]])
+    assert path_shaper.shape(round(0.1 * S), goal, standing({'shoulder': 2.0, 'elbow': 2.0})).states[0, 0].tolist() == [
         2.0,
         2.0,
     ]
 
 
 def test_a_jump_under_way_is_rejected_and_nothing_changes() -> None:
-    by = TrajectoryShaper(ZV)
-    by.shape(0, moved(1), ZERO)
-    far = checked(NAMES, [0.0, 1.0], [[[2.0, 0.0], [], []], [[0.0, 0.0], [], []]])
+    path_shaper = TrajectoryShaper(ZV)
+    path_shaper.shape(0, moved(1), ZERO)
+    jump = checked(NAMES, [0.0, 1.0], [[[2.0, 0.0], [], []], [[0.0, 0.0], [], []]])
     with pytest.raises(ConfigError, match=r'begins .* from where shoulder is commanded'):
-        by.shape(round(0.2 * S), far, ZERO)
+        path_shaper.shape(round(0.2 * S), jump, ZERO)
     there = moved(1).at(np.array([0.2]))[0]
     again = checked(NAMES, [0.0], [[(there[0] + 0.01).tolist(), [], []]])
-    shaped = by.shape(round(0.2 * S), again, ZERO)
+    shaped = path_shaper.shape(round(0.2 * S), again, ZERO)
     assert shaped.states[0, 0, 0] < there[0, 0]
     assert shaped.states[-1, 0].tolist() == (there[0] + 0.01).tolist()
 
@@ -220,19 +220,19 @@ def test_a_jump_under_way_is_rejected_and_nothing_changes() -> None:
 def test_limits_of_the_arm_are_those_of_its_file() -> None:
     limits = read_limits(Path(__file__).parents[3] / 'config' / 'two_links.urdf')
     assert limits == {'shoulder': JointLimits(-2.0, 2.0, 1.0), 'elbow': JointLimits(-math.inf, math.inf, math.inf)}
-    by = TrajectoryShaper(ZV, limits)
+    path_shaper = TrajectoryShaper(ZV, limits)
     with pytest.raises(ConfigError, match=r'shoulder goes to 2.4, must be at most 2 rad or m'):
-        by.shape(0, moved(2, seconds=10.0, to=2.4), ZERO)
+        path_shaper.shape(0, moved(2, seconds=10.0, to=2.4), ZERO)
     with pytest.raises(ConfigError, match=r'shoulder goes to -2.4, must be at least -2'):
-        by.shape(0, moved(1, seconds=10.0, to=-2.4), ZERO)
+        path_shaper.shape(0, moved(1, seconds=10.0, to=-2.4), ZERO)
     with pytest.raises(ConfigError, match=r'shoulder is as fast as 2.4, must be at most 1 rad/s'):
-        by.shape(0, moved(2, seconds=0.5, to=0.8), ZERO)
+        path_shaper.shape(0, moved(2, seconds=0.5, to=0.8), ZERO)
     with pytest.raises(ConfigError, match=r'shoulder goes to -2.4, must be at least -2'):
-        by.shape(0, checked(['shoulder'], [0.0], [[[-2.4], [0.0], []]]), standing({'shoulder': -2.4}))
+        path_shaper.shape(0, checked(['shoulder'], [0.0], [[[-2.4], [0.0], []]]), standing({'shoulder': -2.4}))
     with pytest.raises(ConfigError, match='wrist: the URDF file has no joint of that name'):
-        by.shape(0, checked(['wrist'], [0.0], [[[0.0], [], []]]), standing({'wrist': 0.0}))
-    assert not by.moves(S)
-    assert by.shape(0, moved(2, seconds=4.0, to=1.9), ZERO).states[-1, 0, 0] == 1.9
+        path_shaper.shape(0, checked(['wrist'], [0.0], [[[0.0], [], []]]), standing({'wrist': 0.0}))
+    assert not path_shaper.moves(S)
+    assert path_shaper.shape(0, moved(2, seconds=4.0, to=1.9), ZERO).states[-1, 0, 0] == 1.9
 
 
 GOOD = [[0.0], [], []]
@@ -311,7 +311,7 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
     that replace each other and take ``latencies`` (n,), s, to the controller. ``in_time``: without the steps to those
     that come after their begin."""
     rng = np.random.default_rng(5)
-    by, here, fastest = TrajectoryShaper(ZVD), np.array([0.3, -0.2]), 0.0
+    path_shaper, here, fastest = TrajectoryShaper(ZVD), np.array([0.3, -0.2]), 0.0
     controller = TrajectoryController(here)
     sent = 10.0 + np.cumsum(rng.uniform(0.15, 0.5, len(latencies)))
     # DDS keeps the order.
@@ -325,8 +325,8 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
             point = [rng.uniform(-0.4, 0.4, 2).tolist(), *([[0.0, 0.0]] * (orders - 1)), *([[]] * (3 - orders))]
             start_ns = start_of(round(sent[len(arriving)] * S), 0, lead)
             measured = standing(dict(zip(NAMES, here.tolist(), strict=True)))
-            shaped = by.shape(start_ns, checked(NAMES, [0.4], [point]), measured)
-            fastest = max(fastest, float(by.history[-1].path.fastest()[2].max()))
+            shaped = path_shaper.shape(start_ns, checked(NAMES, [0.4], [point]), measured)
+            fastest = max(fastest, float(path_shaper.history[-1].path.fastest()[2].max()))
             arriving.append((start_ns / S if stamped else 0.0, shaped))
         while arrived < len(arriving) and arrivals[arrived] <= now:
             if now > arriving[arrived][0]:
@@ -364,11 +364,11 @@ def test_message_after_lead_is_the_only_step(orders: int) -> None:
 
 
 def test_first_point_slightly_off_path_makes_no_step() -> None:
-    by = TrajectoryShaper(ZV)
-    by.shape(0, moved(2), ZERO)
+    path_shaper = TrajectoryShaper(ZV)
+    path_shaper.shape(0, moved(2), ZERO)
     there = moved(2).at(np.array([0.2]))[0]
     off = [[(there[0] + 0.04).tolist(), [0.0, 0.0], []], [[0.0, 0.0], [0.0, 0.0], []]]
-    shaped = by.shape(round(0.2 * S), checked(NAMES, [0.0, 0.5], off), ZERO)
+    shaped = path_shaper.shape(round(0.2 * S), checked(NAMES, [0.0, 0.5], off), ZERO)
     at = np.arange(0.0, shaped.duration, 0.001)
     assert np.abs(np.diff(shaped.at(at)[:, 0], axis=0)).max() < 0.001 * 3.0
 
@@ -384,16 +384,16 @@ def test_a_trajectory_begins_when_it_has_arrived() -> None:
 @pytest.mark.parametrize(('speed', 'why'), [(0.3, 'shoulder still moves, at 0.3'), (math.nan, 'is known too shortly')])
 def test_a_trajectory_begins_at_joints_that_stand(speed: float, why: str) -> None:
     """Whoever forgot the motion that is under way does not know where it will be when the next one begins."""
-    by = TrajectoryShaper(ZVD)
+    path_shaper = TrajectoryShaper(ZVD)
     measured = ZERO | {'shoulder': MeasuredJoint(0.0, speed)}
     with pytest.raises(MovingError, match=why):
-        by.shape(0, moved(2), measured)
-    by.shape(0, moved(2), ZERO)
+        path_shaper.shape(0, moved(2), measured)
+    path_shaper.shape(0, moved(2), ZERO)
     # One that goes on from the motion that it knows may begin while they move.
-    by.shape(round(0.2 * S), checked(NAMES, [0.5], [[[0.1, 0.1], [0.0, 0.0], []]]), measured)
-    by.forget()
+    path_shaper.shape(round(0.2 * S), checked(NAMES, [0.5], [[[0.1, 0.1], [0.0, 0.0], []]]), measured)
+    path_shaper.forget()
     with pytest.raises(MovingError):
-        by.shape(round(0.3 * S), moved(2), measured)
+        path_shaper.shape(round(0.3 * S), moved(2), measured)
 
 
 RATE = 1000.0
@@ -407,39 +407,39 @@ def ringing(command: np.ndarray, hertz: float, zeta: float, after: float) -> flo
     return float(np.abs(moved[t > after] - command[-1]).max())
 
 
-@pytest.mark.parametrize(('kind', 'left'), [('zv', 0.01), ('mzv', 0.01), ('zvd', 0.01), ('ei', 1.3 * TOLERATED)])
-def test_the_mode_comes_to_rest(kind: str, left: float) -> None:
-    found = shaper(kind, 14.0, 0.02)
+@pytest.mark.parametrize(('kind', 'share'), [('zv', 0.01), ('mzv', 0.01), ('zvd', 0.01), ('ei', 1.3 * TOLERATED)])
+def test_the_mode_comes_to_rest(kind: str, share: float) -> None:
+    chosen = shaper(kind, 14.0, 0.02)
     step = np.where(np.arange(2000) >= 100, 1.0, 0.0)
-    shaped = found.shaped(step, RATE)
+    shaped = chosen.shaped(step, RATE)
     assert shaped[-1] == pytest.approx(1.0)
-    end = 0.101 + found.duration
-    assert ringing(shaped, 14.0, 0.02, end) < left
+    end = 0.101 + chosen.duration
+    assert ringing(shaped, 14.0, 0.02, end) < share
     assert ringing(step, 14.0, 0.02, end) > 0.7
 
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_the_residual_is_what_a_simulation_leaves(kind: str) -> None:
-    found = shaper(kind, 14.0, 0.0)
+    chosen = shaper(kind, 14.0, 0.0)
     step = np.where(np.arange(3000) >= 100, 1.0, 0.0)
     for hertz in (11.0, 13.0, 15.5):
-        simulated = ringing(found.shaped(step, RATE), hertz, 1e-6, 0.101 + found.duration)
-        assert found.residual(hertz, 0.0)[0] == pytest.approx(simulated, abs=0.01)
+        simulated = ringing(chosen.shaped(step, RATE), hertz, 1e-6, 0.101 + chosen.duration)
+        assert chosen.residual(hertz, 0.0)[0] == pytest.approx(simulated, abs=0.01)
 
 
 def test_a_wrong_frequency_is_forgiven_in_this_order() -> None:
-    left = {kind: float(shaper(kind, 14.0, 0.01).residual(15.4, 0.01)[0]) for kind in KINDS}
-    assert left['zv'] > left['mzv'] > left['zvd'] > left['ei']
+    residuals = {kind: float(shaper(kind, 14.0, 0.01).residual(15.4, 0.01)[0]) for kind in KINDS}
+    assert residuals['zv'] > residuals['mzv'] > residuals['zvd'] > residuals['ei']
 
 
 def test_the_recommended_one_is_the_shortest_that_suffices() -> None:
-    found = recommended(14.0, 0.001, 0.02)
+    chosen = recommended(14.0, 0.001, 0.02)
     band = np.linspace(0.95 * 14.0, 1.05 * 14.0, 21)
-    assert found.residual(band, 0.02).max() <= TOLERATED
-    shorter = [shaper(k, 14.0, 0.02) for k in KINDS if shaper(k, 14.0, 0.02).duration < found.duration]
+    assert chosen.residual(band, 0.02).max() <= TOLERATED
+    shorter = [shaper(k, 14.0, 0.02) for k in KINDS if shaper(k, 14.0, 0.02).duration < chosen.duration]
     assert shorter
     assert all(s.residual(band, 0.02).max() > TOLERATED for s in shorter)
-    assert recommended(14.0, 0.7, 0.02).duration > found.duration
+    assert recommended(14.0, 0.7, 0.02).duration > chosen.duration
 
 
 def test_each_column_is_shaped() -> None:

@@ -233,12 +233,12 @@ def test_sample_decodes_for_its_number_of_psds_only(sample: tuple[SampleFrame, b
     frame, wide = sample
     stream = b'\x00' + encode(frame, wide=wide)
     assert len(stream) - 2 <= MAX_ENCODED
-    (found,) = FrameDecoder(psds).feed(stream)
+    (decoded,) = FrameDecoder(psds).feed(stream)
     if 3 * psds == len(frame.counts):
-        assert found == frame
+        assert decoded == frame
     else:
-        assert isinstance(found, BadFrame)
-        assert found.reason == BadReason.LENGTH
+        assert isinstance(decoded, BadFrame)
+        assert decoded.reason == BadReason.LENGTH
 
 
 @pytest.mark.parametrize('count', [0, 3, 5, 7, 3 * MOST_PSDS + 3])
@@ -325,7 +325,7 @@ def test_a_hello_and_a_line_of_any_json_are_harmless(value: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ('value', 'kept'),
+    ('value', 'text'),
     [
         ([[1, 2]], [[1, 2]]),
         ([[1, [2]]], [[1, '[2]']]),
@@ -333,8 +333,8 @@ def test_a_hello_and_a_line_of_any_json_are_harmless(value: Any) -> None:
         ({'b': {'c': {'d': 1}}}, {'b': {'c': "{'d': 1}"}}),
     ],
 )
-def test_what_is_nested_over_three_deep_is_kept_as_text(value: object, kept: object) -> None:
-    assert device_words({'a': value}) == {'a': kept}
+def test_what_is_nested_over_three_deep_is_kept_as_text(value: object, text: object) -> None:
+    assert device_words({'a': value}) == {'a': text}
 
 
 @pytest.mark.parametrize('sign', [1, -1])
@@ -344,9 +344,9 @@ def test_whole_numbers_are_kept_as_far_as_json_has_them_exactly(sign: int) -> No
 
 
 def test_a_text_has_200_characters_at_most() -> None:
-    for text, kept in (('x' * 200, 'x' * 200), ('x' * 201, 'x' * 199 + '…')):
-        assert device_words({'a': text, 'b': [text]}) == {'a': kept, 'b': [kept]}
-        assert list(device_words({text: {text: 1}}).items()) == [(kept, {kept: 1})]
+    for text, short in (('x' * 200, 'x' * 200), ('x' * 201, 'x' * 199 + '…')):
+        assert device_words({'a': text, 'b': [text]}) == {'a': short, 'b': [short]}
+        assert list(device_words({text: {text: 1}}).items()) == [(short, {short: 1})]
 
 
 def test_what_is_above_zero() -> None:

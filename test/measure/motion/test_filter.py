@@ -38,11 +38,11 @@ def linear() -> ModalFilter:
     return of(filter_load_walk=[10.0, 10.0, 1.0])
 
 
-def after(one: ModalFilter, blocks: list[FloatArray]) -> TipState:
+def after(modal: ModalFilter, blocks: list[FloatArray]) -> TipState:
     """The motion at the end of ``blocks`` (N, 3) of poses, of which nothing was known before."""
-    one.forget()
+    modal.forget()
     for k, poses in enumerate(blocks):
-        state = one.block(k, 20 * MS * k, SLOTS, poses)
+        state = modal.block(k, 20 * MS * k, SLOTS, poses)
     assert state is not None
     return state
 
@@ -59,20 +59,20 @@ def noise_of_poses(a: int, b: int) -> FloatArray:
 
 @pytest.mark.parametrize('count', [1, 2])
 def test_axis_covariance_is_noise_through_gains(count: int) -> None:
-    one, (pose, velocity) = linear(), np.zeros((2, count, 3, N))
+    modal, (pose, velocity) = linear(), np.zeros((2, count, 3, N))
     for block in range(count):
         for axis in range(3):
             for sample in range(N):
                 blocks = [np.zeros((N, 3)) for _ in range(count)]
                 blocks[block][sample, axis] = 1.0
-                state = after(one, blocks)
+                state = after(modal, blocks)
                 pose[block, axis, sample], velocity[block, axis, sample] = state.pose[axis], state.velocity[axis]
-    state = after(one, [np.zeros((N, 3))] * count)
+    state = after(modal, [np.zeros((N, 3))] * count)
     for a, b in ((0, 1), (0, 2), (1, 2)):
         noise = noise_of_poses(a, b)
         both = [sum(float(g[a] @ noise @ g[b]) for g in gains) for gains in (pose, velocity)]
-        found = [state.covariance[a, b], state.velocity_covariance[a, b]]
-        np.testing.assert_allclose(found, both, rtol=1e-9)
+        blocks_of = [state.covariance[a, b], state.velocity_covariance[a, b]]
+        np.testing.assert_allclose(blocks_of, both, rtol=1e-9)
         assert state.covariance[b, a] == state.covariance[a, b]
         assert state.velocity_covariance[b, a] == state.velocity_covariance[a, b]
 
@@ -84,32 +84,32 @@ def test_what_is_said_ahead_has_the_time_of_then() -> None:
 
 
 def test_acceleration_after_block_moves_nothing_before() -> None:
-    one = linear()
-    one.block(0, 0, SLOTS, np.zeros((N, 3)))
-    still = one.predicted(np.array([0.005]))
+    modal = linear()
+    modal.block(0, 0, SLOTS, np.zeros((N, 3)))
+    still = modal.predicted(np.array([0.005]))
     # The last sample is 9.5 ms after the middle.
-    one.inertia.notify(BaseAcceleration(14 * MS + MS // 2, (5.0, 0.0, 0.0), NONE), 10 * MS)
-    reported = one.predicted(np.array([0.005, 0.006]))
+    modal.inertia.notify(BaseAcceleration(14 * MS + MS // 2, (5.0, 0.0, 0.0), NONE), 10 * MS)
+    reported = modal.predicted(np.array([0.005, 0.006]))
     assert np.array_equal(reported.pose[0], still.pose[0])
     # From rest: half of the acceleration times the square of the time.
     assert reported.pose[1, 0] == pytest.approx(-0.5 * 5.0 * 0.001**2, rel=0.01)
 
 
 def test_a_base_that_is_reported_is_no_load_that_nobody_foresaw() -> None:
-    one = of()
+    modal = of()
     mode = Oscillator(14.0, 0.02)
     base = Inertia((mode, mode, Oscillator(21.0, 0.02)), 0.585)
     for k in range(40):
         reported = BaseAcceleration(10 * MS * k + 200 * MS, (2.0 * np.sin(0.7 * k), 0.0, 0.0), NONE)
         base.notify(reported, 10 * MS * k + 200 * MS)
-        one.inertia.notify(reported, 10 * MS * k + 200 * MS)
+        modal.inertia.notify(reported, 10 * MS * k + 200 * MS)
     moved = base.forced(-10 * MS - MS // 2, 1e-3 * np.arange(1.0, 601.0)).at[:, :, 0].T
     for k in range(30):
-        one.block(k, 20 * MS * k, SLOTS, moved[N * k : N * (k + 1)])
+        modal.block(k, 20 * MS * k, SLOTS, moved[N * k : N * (k + 1)])
     assert np.abs(moved).max() > 2e-4
     # Private: what a load did unseen is added to variances 1e4 times as large.
-    assert one._unseen is not None
-    assert np.sqrt(one._unseen.variances[0].max()) < 1e-6
+    assert modal._unseen is not None
+    assert np.sqrt(modal._unseen.variances[0].max()) < 1e-6
 
 
 MODE = Oscillator(14.0, 0.02)
@@ -183,11 +183,11 @@ def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> No
         miss = y[here] - gains.observed[0] @ x
         posterior = np.linalg.inv(np.linalg.inv(p) + gains.information[0, k])
         score = gains.pulled[0, k] @ miss
-        found = gains.transition[0, k] @ (x + posterior @ score) + gains.smoothed[0, k] @ (miss + gains.observed[0] @ x)
+        state = gains.transition[0, k] @ (x + posterior @ score) + gains.smoothed[0, k] @ (miss + gains.observed[0] @ x)
         covariance = gains.transition[0, k] @ posterior @ gains.transition[0, k].T + gains.residual[0, k]
         squares = miss @ gains.precision[0, k] @ miss - score @ posterior @ score
         size = gains.log_size[0, k] + np.linalg.slogdet(p)[1] - np.linalg.slogdet(posterior)[1]
-        np.testing.assert_allclose(found, expected[0], rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(state, expected[0], rtol=1e-7, atol=1e-12)
         np.testing.assert_allclose(covariance, expected[1], rtol=1e-5, atol=1e-18)
         assert squares == pytest.approx(expected[2], rel=1e-6)
         assert size == pytest.approx(expected[3], abs=1e-6)
@@ -196,7 +196,7 @@ def test_a_block_says_what_a_filter_of_samples_says(lost: tuple[int, ...]) -> No
 def test_filter_weighs_rates_by_how_well_they_predict() -> None:
     """Bayes' rule over 23 Kalman filters, 13 of a load that steps and 10 of one whose rate wanders; their mixture."""
     r = 1e-4
-    one = ModalFilter(motion.rig_of({}), COMPLIANCE, np.eye(3, 4), r * np.eye(4)[:, :, None] * (SLOTS == 0))
+    modal = ModalFilter(motion.rig_of({}), COMPLIANCE, np.eye(3, 4), r * np.eye(4)[:, :, None] * (SLOTS == 0))
     sizes = r / 0.02 * 1e-4 * 10.0 ** np.arange(13)
     rates = [np.array([q, 0.0]) for q in sizes] + [np.array([0.0, q / (MODE.w * 0.02) ** 2]) for q in sizes[:10]]
     change = np.full((23, 23), 0.01 / 23)
@@ -207,17 +207,17 @@ def test_filter_weighs_rates_by_how_well_they_predict() -> None:
         change[k, min(k + 1, last)] += 0.01
     x, p, weights = np.zeros(4), np.eye(4), np.full(23, 1.0 / 23)
     for block, y in enumerate(np.random.default_rng(4).normal([[0.0], [0.0], [0.03], [0.02]], 0.01, (4, N))):
-        found = [by_samples(y, list(SLOTS), x, p, rate, r) for rate in rates]
-        weights = weights @ change * np.exp([-0.5 * (squares + size - found[0][3]) for *_, squares, size in found])
+        states = [by_samples(y, list(SLOTS), x, p, rate, r) for rate in rates]
+        weights = weights @ change * np.exp([-0.5 * (squares + size - states[0][3]) for *_, squares, size in states])
         weights /= weights.sum()
-        x = sum(w * f[0] for w, f in zip(weights, found, strict=True))
-        p = sum(w * (f[1] + np.outer(f[0] - x, f[0] - x)) for w, f in zip(weights, found, strict=True))
-        state = one.block(block, 20 * MS * block, SLOTS, np.column_stack([y, y, y]))
+        x = sum(w * f[0] for w, f in zip(weights, states, strict=True))
+        p = sum(w * (f[1] + np.outer(f[0] - x, f[0] - x)) for w, f in zip(weights, states, strict=True))
+        state = modal.block(block, 20 * MS * block, SLOTS, np.column_stack([y, y, y]))
         assert state is not None
         got = [state.pose[0], state.velocity[0], state.covariance[0, 0], state.velocity_covariance[0, 0]]
         np.testing.assert_allclose(got, [x[0], MODE.w * x[1], p[0, 0], MODE.w**2 * p[1, 1]], rtol=1e-6)
-    walk = math.sqrt(sum(w * rate[0] for w, rate in zip(weights, rates, strict=True)))
-    assert one.load_walk()[0] == pytest.approx(walk / COMPLIANCE[0], rel=1e-6)
+    random_walk = math.sqrt(sum(w * rate[0] for w, rate in zip(weights, rates, strict=True)))
+    assert modal.load_walk()[0] == pytest.approx(random_walk / COMPLIANCE[0], rel=1e-6)
 
 
 def test_known_load_acts_from_its_stamp_on() -> None:
@@ -230,13 +230,13 @@ def test_known_load_acts_from_its_stamp_on() -> None:
         known.add(load)
     assert [known.is_new(load) for load in loads] == [True, True, False]
     # Samples from 0.5 to 19.5 ms; the first load began before.
-    found = known.pushed(10 * MS, first=False)
-    assert found is not None
+    push = known.pushed(10 * MS, first=False)
+    assert push is not None
     size = np.array(COMPLIANCE) * [2.0, 0.0, -3.0]
     effective = [expm(system(MODE) * (t - 5e-3))[:, 2] if t > 5e-3 else np.zeros(4) for t in PERIOD * (SLOTS + 0.5)]
-    np.testing.assert_allclose(found.samples, size[:, None] * [state[0] for state in effective], atol=1e-15)
-    np.testing.assert_allclose(found.end, size[:, None] * effective[-1], atol=1e-15)
-    np.testing.assert_allclose(found.variance, (0.05 * size) ** 2)
+    np.testing.assert_allclose(push.samples, size[:, None] * [state[0] for state in effective], atol=1e-15)
+    np.testing.assert_allclose(push.end, size[:, None] * effective[-1], atol=1e-15)
+    np.testing.assert_allclose(push.variance, (0.05 * size) ** 2)
     assert known.is_new(loads[1])
     assert not known.is_new(loads[2])
 

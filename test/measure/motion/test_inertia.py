@@ -53,9 +53,9 @@ def integrated(changes: Sequence[tuple[float, Sequence[float]]], t: FloatArray) 
                 return [y[1], -2.0 * zeta * w * y[1] - w * w * y[0] - a]
 
             inside = (t >= begin) & (t < end)
-            found = solve_ivp(rate, (begin, end), state, t_eval=[*t[inside], end], rtol=1e-10, atol=1e-14).y
-            out[axis, inside] = (found[:, :-1] / np.array([[1.0], [w]])).T
-            state = found[:, -1]
+            solution = solve_ivp(rate, (begin, end), state, t_eval=[*t[inside], end], rtol=1e-10, atol=1e-14).y
+            out[axis, inside] = (solution[:, :-1] / np.array([[1.0], [w]])).T
+            state = solution[:, -1]
     return out
 
 
@@ -69,13 +69,13 @@ def test_it_is_the_solution_of_the_equation_of_motion() -> None:
     for i in (2, 0, 1, 1):
         known.notify(reported[i], 0)
     seconds = 1e-3 * np.arange(1.0, 21.0)
-    found = known.forced(0, seconds)
+    forced = known.forced(0, seconds)
     changes = [(0.0, rigid_tip(reported[0])), (0.0073, rigid_tip(reported[1])), (0.012, rigid_tip(reported[2]))]
-    np.testing.assert_allclose(found.at[..., :2], integrated(changes, seconds), rtol=1e-7, atol=1e-13)
-    assert not found.at[..., 2:].any()
+    np.testing.assert_allclose(forced.at[..., :2], integrated(changes, seconds), rtol=1e-7, atol=1e-13)
+    assert not forced.at[..., 2:].any()
     # Of two changes that other messages led to, the twentieth part may be wrong.
     sizes = np.abs(np.diff([a for _, a in changes], axis=0)).sum(axis=0) / np.array([mode.w for mode in MODES]) ** 2
-    np.testing.assert_allclose(found.doubt, 0.05 * sizes)
+    np.testing.assert_allclose(forced.doubt, 0.05 * sizes)
     assert (known.count, known.late) == (4, 1)
 
 
@@ -84,11 +84,11 @@ def test_acceleration_holds_0_1_s_and_starts_uncertain() -> None:
     first = BaseAcceleration(10 * MS, (1.0, 0.0, 0.0), NONE)
     known.notify(first, 0)
     seconds = 1e-3 * np.arange(1.0, 201.0)
-    found = known.forced(0, seconds)
+    forced = known.forced(0, seconds)
     changes = [(0.0, NONE), (0.010, (1.0, 0.0, 0.0)), (0.110, NONE)]
-    np.testing.assert_allclose(found.at[..., :2], integrated(changes, seconds), rtol=1e-7, atol=1e-13)
+    np.testing.assert_allclose(forced.at[..., :2], integrated(changes, seconds), rtol=1e-7, atol=1e-13)
     # It may have begun before it was told, and nobody knows how it ended.
-    assert found.doubt[0] == pytest.approx(2.0 / MODES[0].w ** 2)
+    assert forced.doubt[0] == pytest.approx(2.0 / MODES[0].w ** 2)
     known.notify(BaseAcceleration(111 * MS, (1.0, 0.0, 0.0), NONE), 100 * MS)
     assert known.forced(0, seconds[:150]).doubt[0] == pytest.approx(3.0 / MODES[0].w ** 2)
     known.forget_before(10 * MS + HOLD_NS)
@@ -135,9 +135,9 @@ def rotated(seconds: float) -> motion.Run:
         (0.0, NONE),
         *((b, rigid_tip(BaseAcceleration(0, NONE, a))) for b, a in zip(begins, angular, strict=True)),
     ]
-    found = integrated(changes, t)
-    pose = found[..., 0].T
-    velocity = (found[..., 1] * np.array([[mode.w] for mode in MODES])).T
+    states = integrated(changes, t)
+    pose = states[..., 0].T
+    velocity = (states[..., 1] * np.array([[mode.w] for mode in MODES])).T
     reported = []
     for ms in range(25, len(t), 5):
         now = int(np.searchsorted(begins, ms / 1000.0 + 1e-6)) - 1
@@ -208,12 +208,12 @@ def test_diagnostics_say_what_is_wrong_with_what_is_reported(run: motion.Run) ->
 
     def entry() -> DiagnosticEntry:
         # Private: a whole report needs a session with a device.
-        (one,) = health._motion()
-        return one
+        (motion_entry,) = health._motion()
+        return motion_entry
 
     def message() -> tuple[int, str]:
-        one = entry()
-        return one.level, one.message
+        status = entry()
+        return status.level, status.message
 
     reported = list(run.reported)
     through(pipeline, run, range(25), reported)
@@ -232,11 +232,11 @@ def test_diagnostics_say_what_is_wrong_with_what_is_reported(run: motion.Run) ->
 def test_a_memory_that_is_none_is_rejected() -> None:
     filtered = Pipeline(motion.rig_of()).motion_filter
     assert filtered is not None
-    one = (5.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-    for values in (one, (4.0, *one[1:], *6 * one), (math.inf,), (-4.0, *9 * one), (*one, *5 * (0.0,), math.nan)):
+    row = (5.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+    for values in (row, (4.0, *row[1:], *6 * row), (math.inf,), (-4.0, *9 * row), (*row, *5 * (0.0,), math.nan)):
         with pytest.raises(ValueError, match=r'state.inertia: .* in blocks of 20 samples'):
             filtered.load_state_dict({INERTIA: values})
-    filtered.load_state_dict({INERTIA: (*one, *one)})
+    filtered.load_state_dict({INERTIA: (*row, *row)})
     assert filtered.inertia.reported == [(1_000_000_000, (0.0, 0.0, 0.0))]
 
 
@@ -276,7 +276,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, run: moti
         for record in live.flush():
             bag.put(record)
     recording = open_recording(tmp_path / 'bag')
-    found = [
+    replayed_rows = [
         m for records in replayed(recording, Pipeline(rig_from_values(recording.parameters))) for m in moved(records)
     ]
-    assert found == expected
+    assert replayed_rows == expected

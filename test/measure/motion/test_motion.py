@@ -122,10 +122,10 @@ def test_a_restart_begins_anew(operation: motion.Run) -> None:
     through(pipeline, operation, range(200))
     late = motion.chunk(operation, 200)
     later = RawChunk(late.seq + 20, late.t_ns + 300_000_000, late.readings, late.flags)
-    found = [r for r in pipeline.process(later) if isinstance(r, TipMotion)][-1]
+    tip = [r for r in pipeline.process(later) if isinstance(r, TipMotion)][-1]
     assert pipeline.motion_filter is not None
     assert pipeline.motion_filter.predictions_only == 0
-    assert np.all(np.abs(pose(found) - operation.pose[4019]) < 5.0 * np.sqrt(found.covariance[::4]))
+    assert np.all(np.abs(pose(tip) - operation.pose[4019]) < 5.0 * np.sqrt(tip.covariance[::4]))
 
 
 def test_no_filter_no_motion_and_a_long_block_is_rejected(operation: motion.Run) -> None:

@@ -37,27 +37,27 @@ def unknowns_of(tilts: Tilts) -> int:
 
 
 @pytest.mark.parametrize('tilts', ['none', 'tied', 'bounded', 'free'])
-@pytest.mark.parametrize('kept', [[0, 1, 2], [0, 2]])
-def test_plate_model_residual_is_the_unexplained_part(tilts: Tilts, kept: list[int]) -> None:
-    if tilts == 'free' and len(kept) == 2:
+@pytest.mark.parametrize('subset', [[0, 1, 2], [0, 2]])
+def test_plate_model_residual_is_the_unexplained_part(tilts: Tilts, subset: list[int]) -> None:
+    if tilts == 'free' and len(subset) == 2:
         return
     rig = rig_of(3)
-    model = PlateModel(rig, kept, tilts)
+    model = PlateModel(rig, subset, tilts)
     k = {'none': 0.0, 'free': 0.0}.get(tilts, rig.link.slope_ratio / rig.link.length)
     rng = np.random.default_rng(1)
     poses = rng.uniform(-1.0, 1.0, (6, 5)) * (3e-3, 3e-3, 0.03, 0.01, 0.01)
     if tilts != 'free':
         poses[:, 3], poses[:, 4] = -k * poses[:, 1], k * poses[:, 0]
-    heights = np.zeros(len(kept)) if tilts == 'none' else rig.heights[kept]
-    beams = (rig.centers + rig.zeros)[kept]
+    heights = np.zeros(len(subset)) if tilts == 'none' else rig.heights[subset]
+    beams = (rig.centers + rig.zeros)[subset]
     np.testing.assert_array_equal(model.beams, beams)
-    exact = (plate_points(poses, beams, heights) - rig.centers[kept]).reshape(6, -1)
+    exact = (plate_points(poses, beams, heights) - rig.centers[subset]).reshape(6, -1)
     assert np.abs(model.residuals(exact)).max() < 1e-10
     # Of small errors about rest: what least squares of the slopes leaves.
-    errors = 1e-7 * rng.normal(size=(4, 2 * len(kept)))
+    errors = 1e-7 * rng.normal(size=(4, 2 * len(subset)))
     slopes = model.slopes_at((0.0,) * 5)
-    assert slopes.shape == (2 * len(kept), unknowns_of(tilts))
-    at_rest = rig.zeros[kept].ravel()
+    assert slopes.shape == (2 * len(subset), unknowns_of(tilts))
+    at_rest = rig.zeros[subset].ravel()
     want = errors - errors @ np.linalg.pinv(slopes).T @ slopes.T
     np.testing.assert_allclose(model.residuals(at_rest + errors), want, atol=1e-12)
 
@@ -111,10 +111,10 @@ def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
     moved.set_zeros(new)
     rng = np.random.default_rng(3)
     samples, residual = (new.zeros.ravel() + 1e-6 * rng.normal(size=(n, 2 * psds)) for n in (20, 1))
-    one, other = (of.full.fit.fit(ALL, samples) for of in (moved, fresh))
-    assert one[0] == other[0]
-    np.testing.assert_array_equal(one[1], other[1])
-    answers = [checked(of, np.array(one[0]), residual[0], one[1]) for of in (moved, fresh)]
+    fitted, other = (of.full.fit.fit(ALL, samples) for of in (moved, fresh))
+    assert fitted[0] == other[0]
+    np.testing.assert_array_equal(fitted[1], other[1])
+    answers = [checked(of, np.array(fitted[0]), residual[0], fitted[1]) for of in (moved, fresh)]
     assert answers[0] == answers[1]
     for of in (moved, fresh):
         for block in range(100):
@@ -145,11 +145,11 @@ def test_segments_change_the_noise_of_all_sets() -> None:
 
 
 def test_a_subset_has_the_noise_of_its_own_readings() -> None:
-    rig, own = rig_of(3), np.array([1.0, 2.0, 4.0, 8.0]) * 1e-12
+    rig, variance = rig_of(3), np.array([1.0, 2.0, 4.0, 8.0]) * 1e-12
     subset = PsdSet(rig, (0, 2), 'none')
-    subset.set_noise(StreamNoise(20, rig.centers, rig.centers + rig.zeros, np.insert(own, 2, (1e-10, 1e-10)), 0.0))
+    subset.set_noise(StreamNoise(20, rig.centers, rig.centers + rig.zeros, np.insert(variance, 2, (1e-10, 1e-10)), 0.0))
     fitted = subset.fit.fit(ALL, np.tile(rig.zeros.ravel(), (20, 1))[:, subset.columns])
-    np.testing.assert_allclose(np.diag(fitted.covariance), own / 20.0, rtol=0.1)
+    np.testing.assert_allclose(np.diag(fitted.covariance), variance / 20.0, rtol=0.1)
 
 
 def test_the_base_line_is_between_the_places_of_the_dots() -> None:
@@ -169,9 +169,9 @@ def test_nothing_is_redundant_while_the_tilt_is_only_bounded() -> None:
     of = BlockEstimator(rig, tilts='free')
     for tilts, freedom in (('bounded', 0), ('none', 1)):
         psds = BlockEstimator(rig, tilts='free').subset((0, 1), tilts)  # type: ignore[arg-type]
-        found = psds.unexplained(tuple(rig.zeros[:2].ravel().tolist()), (0.0,) * 4, 1e-12 * np.eye(4), (0.0,) * 5)
-        assert of.check(psds, found, None).freedom == freedom
-        assert psds.check.agrees(found, 1.0) == bool(freedom)
+        residual = psds.unexplained(tuple(rig.zeros[:2].ravel().tolist()), (0.0,) * 4, 1e-12 * np.eye(4), (0.0,) * 5)
+        assert of.check(psds, residual, None).freedom == freedom
+        assert psds.check.agrees(residual, 1.0) == bool(freedom)
 
 
 def moves(um: list[float], noise_um: float = 0.01) -> str:

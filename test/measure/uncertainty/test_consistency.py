@@ -94,9 +94,9 @@ def test_limits_of_one_degree_are_those_of_the_shares() -> None:
 def test_covariance_is_widened_by_each_error_alone() -> None:
     gain = np.linalg.pinv(DESIGN)
     errors = (1e-5, -2e-5, 0.0, 3e-5)
-    own = gain @ COVARIANCE @ gain.T
-    want = own + sum(np.outer(gain[:, i] * e, gain[:, i] * e) for i, e in enumerate(errors))
-    np.testing.assert_allclose(consistency.widened(own, gain, errors), want, rtol=1e-12, atol=1e-24)
+    noise = gain @ COVARIANCE @ gain.T
+    want = noise + sum(np.outer(gain[:, i] * e, gain[:, i] * e) for i, e in enumerate(errors))
+    np.testing.assert_allclose(consistency.widened(noise, gain, errors), want, rtol=1e-12, atol=1e-24)
 
 
 RNG = np.random.default_rng(7)
@@ -149,8 +149,8 @@ def test_psd_error_is_least_squares_with_two_unknowns(psd: int) -> None:
     assert got.freedom == 5
     for other in range(PSDS):
         more = np.eye(2 * PSDS)[:, 2 * other : 2 * other + 2]
-        found, _ = residual_of(readings, np.column_stack((SLOPES, more)), FULL)
-        np.testing.assert_allclose(got.errors[2 * other : 2 * other + 2], found[-2:], rtol=1e-6)
+        solution, _ = residual_of(readings, np.column_stack((SLOPES, more)), FULL)
+        np.testing.assert_allclose(got.errors[2 * other : 2 * other + 2], solution[-2:], rtol=1e-6)
 
 
 @pytest.mark.parametrize('unknowns', [6, 7])
@@ -162,9 +162,9 @@ def test_each_reading_has_own_error_at_low_freedom(unknowns: int) -> None:
     assert got.freedom == 2 * PSDS - unknowns
     shows = unexplained(slopes).diagonal()
     for i, error in enumerate(got.errors):
-        found, _ = residual_of(readings, np.column_stack((slopes, np.eye(2 * PSDS)[:, i])), FULL)
+        solution, _ = residual_of(readings, np.column_stack((slopes, np.eye(2 * PSDS)[:, i])), FULL)
         # A reading that hardly shows cannot be checked.
-        assert error == pytest.approx(found[-1] if shows[i] > 4e-4 * shows.max() else 0.0, rel=1e-6)
+        assert error == pytest.approx(solution[-1] if shows[i] > 4e-4 * shows.max() else 0.0, rel=1e-6)
     assert sum(error == 0.0 for error in got.errors) == (unknowns == 7)
 
 
@@ -334,16 +334,16 @@ def named(message: FloatArray, should: FloatArray, noise: float) -> str:
     for psd in (1, 2):
         if off[psd] < 0.01 * off[0] and off[psd] < weights.sum() * (10.0 * noise) ** 2:
             return f'the axes of psd_{psd} are exchanged'
-    found = []
+    names = []
     for c, name in enumerate(('x1', 'y1', 'x2', 'y2')):
-        own, shared, wanted = np.cov(message[:, c], should[:, c], aweights=weights, ddof=0)[[0, 0, 1], [0, 1, 1]]
+        variance, shared, wanted = np.cov(message[:, c], should[:, c], aweights=weights, ddof=0)[[0, 0, 1], [0, 1, 1]]
         if wanted < (100.0 * noise) ** 2:
             continue
-        if own < (5.0 * noise) ** 2:
-            found.append(f'{name} does not move with the others')
-        elif abs(shared / wanted + 1.0) < 0.02 and own - shared**2 / wanted < (10.0 * noise) ** 2 + 1e-4 * wanted:
-            found.append(f'{name} has the wrong sign')
-    return found[0] if len(found) == 1 else ''
+        if variance < (5.0 * noise) ** 2:
+            names.append(f'{name} does not move with the others')
+        elif abs(shared / wanted + 1.0) < 0.02 and variance - shared**2 / wanted < (10.0 * noise) ** 2 + 1e-4 * wanted:
+            names.append(f'{name} has the wrong sign')
+    return names[0] if len(names) == 1 else ''
 
 
 def test_a_reading_is_named_by_the_moments_of_what_was_observed() -> None:

@@ -100,9 +100,9 @@ def test_restless_rig_takes_noise_colour_of_base_line() -> None:
 def test_blocks_of_two_samples_beyond_orders_tell_roughness(present: int, reported: bool) -> None:
     """In motion, by five orders: x1 is ten times as noisy in three of five blocks, which have so many samples."""
     noise, few = stream(), np.arange(3 * SEGMENT_BLOCKS) % 5 > 1
-    own = coloured(3 * SEGMENT, 0.0, 24).reshape(-1, SIZE, 4)
-    own[few, :, 0] *= 10.0
-    for block, dots in enumerate(own + ringing(3 * SEGMENT).reshape(-1, SIZE, 4)):
+    rough = coloured(3 * SEGMENT, 0.0, 24).reshape(-1, SIZE, 4)
+    rough[few, :, 0] *= 10.0
+    for block, dots in enumerate(rough + ringing(3 * SEGMENT).reshape(-1, SIZE, 4)):
         slots = ALL[: 3 * present : 3] if few[block] else ALL
         noise.add(block, slots, dots[slots])
     x1, y1, *_ = noise.sample_sd()
@@ -150,16 +150,16 @@ def test_a_dead_reading_is_no_better_than_a_converters_step() -> None:
 
 
 def test_another_one_goes_on_from_the_state_to_the_bit() -> None:
-    one, other = stream(), stream()
-    feed(one, coloured(5 * SEGMENT + 7 * SIZE, 0.3, 18))
-    other.set_state(one.state())
-    other.set_segment(one.segment())
+    first, other = stream(), stream()
+    feed(first, coloured(5 * SEGMENT + 7 * SIZE, 0.3, 18))
+    other.set_state(first.state())
+    other.set_segment(first.segment())
     # Of whole segments each lag has all its pairs.
-    np.testing.assert_allclose(one.state()[-SIZE:], 1.0 - np.arange(SIZE) / SEGMENT)
+    np.testing.assert_allclose(first.state()[-SIZE:], 1.0 - np.arange(SIZE) / SEGMENT)
     more = coloured(3 * SEGMENT, 0.3, 19, 1.2 * SIGMA)
-    for noise in (one, other):
+    for noise in (first, other):
         feed(noise, more, 5 * SEGMENT_BLOCKS + 7)
-    assert (one.gamma == other.gamma).all()
+    assert (first.gamma == other.gamma).all()
     with pytest.raises(ValueError, match='346 values, not 5'):
         other.set_state((0.0,) * 5)
 
@@ -175,17 +175,17 @@ def test_gaps_take_nothing_off_the_colour_of_hum() -> None:
         noise.add(block, slots, dots[SIZE * block + slots])
     hum = 0.5 * 2.5**2 * np.cos(0.12 * np.pi * np.arange(SIZE))
     hum[0] += 1.0
-    own = noise.gamma[range(4), range(4)].mean(axis=0) / SIGMA**2
+    autocorrelation = noise.gamma[range(4), range(4)].mean(axis=0) / SIGMA**2
     # What is sure alone has 5 % too much at lag 0: the rest of it is as it is.
-    assert abs(own[0] / hum[0] - 1.0) < 0.015
-    np.testing.assert_allclose(own, hum, atol=0.07)
+    assert abs(autocorrelation[0] / hum[0] - 1.0) < 0.015
+    np.testing.assert_allclose(autocorrelation, hum, atol=0.07)
 
 
 def test_what_remembers_nothing_goes_on_as_from_the_start() -> None:
-    one, other = stream(), stream()
-    other.set_state(one.state())
-    assert one.state() == other.state() == (0.0,) * 6
-    np.testing.assert_array_equal(one.gamma, other.gamma)
+    first, other = stream(), stream()
+    other.set_state(first.state())
+    assert first.state() == other.state() == (0.0,) * 6
+    np.testing.assert_array_equal(first.gamma, other.gamma)
 
 
 # Segments that are one and the same but for their size: its autocovariance goes with the variance exactly.
@@ -212,11 +212,11 @@ RULES = {
 
 
 def test_segments_follow_the_rules() -> None:
-    one, wrong = coloured(SEGMENT, 0.0, 30), {}
+    segment, wrong = coloured(SEGMENT, 0.0, 30), {}
     for rule, (segments, want) in RULES.items():
         noise = stream()
         for k, times in enumerate(segments):
-            feed(noise, abs(times) ** 0.5 * one + (ringing(SEGMENT) if times < 0.0 else 0.0), k * SEGMENT_BLOCKS)
+            feed(noise, abs(times) ** 0.5 * segment + (ringing(SEGMENT) if times < 0.0 else 0.0), k * SEGMENT_BLOCKS)
             if k == 1:
                 first = noise.sample_sd()
         got = float(np.mean(np.square(noise.sample_sd() / first)))
@@ -299,10 +299,10 @@ def test_channels_that_never_change_report_by_their_levels() -> None:
 @pytest.mark.parametrize('noise', [1.0, 0.0])
 def test_what_is_coarser_than_the_coarsest_converter_is_no_step(noise: float) -> None:
     """Volts that lie on multiples of 20 V / 2^7, and toggle or stand still."""
-    for step, found in ((2.0 * COARSEST, 0.0), (COARSEST, COARSEST)):
+    for step, estimated in ((2.0 * COARSEST, 0.0), (COARSEST, COARSEST)):
         steps = ConverterSteps.of_rig(load_rig())
         steps.add(volts(step, noise))
-        np.testing.assert_allclose(steps.steps, found, rtol=1e-5)
+        np.testing.assert_allclose(steps.steps, estimated, rtol=1e-5)
 
 
 def test_a_coarse_channel_beside_fine_ones_is_that_channel() -> None:
@@ -496,7 +496,7 @@ class Dense:
         z, n = self.of.of(dots), len(slots)
         reported = min(self.orders, (n + 1) // 2)
         before, q = self.usual(), self.q[slots]
-        weights, more, value, misfit = np.zeros((4, self.size)), np.zeros(4), np.zeros(4), False
+        weights, more, value, poor_fit = np.zeros((4, self.size)), np.zeros(4), np.zeros(4), False
         for a in range(4):
             precision = np.linalg.inv(self.noise_covariance[a, a][np.ix_(slots, slots)])
             noise_covariance = self.information(a, slots, reported)
@@ -525,11 +525,11 @@ class Dense:
             residual = z[a] - z[a].mean() - q[:, :reported] @ c
             free = n - reported
             if free > 0 and residual @ precision @ residual > free + 5.0 * (2.0 * free) ** 0.5:
-                misfit = True
+                poor_fit = True
                 more[a] += float(residual @ residual) / free
         covariance = np.einsum('as,abst,bt->ab', weights, self.noise_covariance, weights) + np.diag(more)
         dots, noise_covariance = self.of.back(value[None], covariance[None])
-        return tuple(dots[0].tolist()), noise_covariance[0], misfit
+        return tuple(dots[0].tolist()), noise_covariance[0], poor_fit
 
 
 @pytest.mark.parametrize('size', [5, 12, 20])
@@ -561,26 +561,26 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
             # So few at one end that nothing is learnt of motion, and what was is forgotten.
             slots = np.arange(size - size // 3 - 1, size)
         got = fit.fit(slots, dots[slots])
-        want, covariance, misfit = dense.fit(slots, dots[slots])
+        want, covariance, poor_fit = dense.fit(slots, dots[slots])
         sd = np.sqrt(np.diag(covariance))
-        assert got.poor_fit == misfit, block
+        assert got.poor_fit == poor_fit, block
         np.testing.assert_allclose((np.array(got.dots) - want) / sd, 0.0, atol=1e-6, err_msg=str(block))
         np.testing.assert_allclose((got.covariance - covariance) / np.outer(sd, sd), 0.0, atol=1e-6, err_msg=str(block))
-        misfits += misfit
+        misfits += poor_fit
     assert misfits > 0
 
 
 def shaken(fit: BlockFit, hz: float, amplitude: float, blocks: int, seed: int = 5) -> tuple[FloatArray, FloatArray]:
     """Error over standard deviation (n,) of x1, and that (n,), of both plates' x that sway along with white noise."""
     rng = np.random.default_rng(seed)
-    turn = 2.0 * np.pi * hz / 1000.0
+    omega = 2.0 * np.pi * hz / 1000.0
     errors, sds = [], []
     for block in range(blocks):
-        sway = amplitude * np.sin(turn * (block * SIZE + ALL) + 0.7)
+        sway = amplitude * np.sin(omega * (block * SIZE + ALL) + 0.7)
         dots = np.outer(sway, [1.0, 0.0, 1.0, 0.0]) + rng.normal(0.0, SIGMA, (SIZE, 4))
         fitted = fit.fit(ALL, dots)
         sds.append(float(fitted.covariance[0, 0] ** 0.5))
-        errors.append(fitted.dots[0] - amplitude * np.sin(turn * (block * SIZE + 9.5) + 0.7))
+        errors.append(fitted.dots[0] - amplitude * np.sin(omega * (block * SIZE + 9.5) + 0.7))
     return np.array(errors) / np.array(sds), np.array(sds)
 
 
@@ -628,8 +628,8 @@ def swaying(size: int, lost: tuple[int, ...] = ()) -> FloatArray:
     seq = seq[~np.isin(seq % size, lost)]
     pipeline = Pipeline(load_rig(overrides={'block_size': size, 'min_samples': 5, 'solvers': ['exact']}))
     chunk = RawChunk(seq, seq * 1_000_000, volts[seq].astype(np.float32), np.zeros(len(seq), np.uint8))
-    found = [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.t_ns > 5_000_000_000]
-    return np.array([(r.dy - 3e-4 * np.sin(88.0e-9 * r.t_ns + 0.3)) / r.covariance[4] ** 0.5 for r in found])
+    estimates = [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.t_ns > 5_000_000_000]
+    return np.array([(r.dy - 3e-4 * np.sin(88.0e-9 * r.t_ns + 0.3)) / r.covariance[4] ** 0.5 for r in estimates])
 
 
 def test_blocks_losing_their_end_cover_their_error() -> None:

@@ -34,7 +34,7 @@ def noise(seed: int, columns: int = 2, n: int = N) -> FloatArray:
     return 1e-6 * np.random.default_rng(seed).normal(size=(n, columns))
 
 
-def found(
+def moving_tones(
     moving: FloatArray, still: FloatArray, places: IntArray = ALL, known: tuple[float, ...] = ()
 ) -> tuple[Tone, ...]:
     return ToneSearch(SIZE, SEGMENT_BLOCKS).tones(places, moving @ TURN, still, TURN, known).moving
@@ -43,24 +43,24 @@ def found(
 @pytest.mark.parametrize('hz', [26.0, 36.4, 47.0, 87.0, 130.4, 300.0, 480.0])
 def test_a_tone_is_found_with_its_frequency_and_its_covariance(hz: float) -> None:
     amplitudes = np.array([5e-6, -2e-6])
-    (one,) = found(noise(1) + tone(hz)[:, None] * amplitudes, noise(2))
-    assert one.frequency * RATE == pytest.approx(hz, abs=0.1)
+    (peak,) = moving_tones(noise(1) + tone(hz)[:, None] * amplitudes, noise(2))
+    assert peak.frequency * RATE == pytest.approx(hz, abs=0.1)
     want = TURN.T @ np.outer(amplitudes, amplitudes) @ TURN / 2.0
-    np.testing.assert_allclose(one.covariance, want, rtol=0.05, atol=6e-13)
+    np.testing.assert_allclose(peak.covariance, want, rtol=0.05, atol=6e-13)
 
 
 def test_two_tones_are_two_and_what_does_not_take_part_stays_out() -> None:
     moving = noise(1)
     moving[:, 0] += 3e-6 * tone(87.0)
     moving[:, 1] += 9e-6 * tone(180.0)
-    second, first = sorted(found(moving, noise(2)), key=rms_of)
+    second, first = sorted(moving_tones(moving, noise(2)), key=rms_of)
     assert [round(t.frequency * RATE) for t in (first, second)] == [180, 87]
     np.testing.assert_allclose(first.covariance, np.outer(TURN[1], TURN[1]) * 9e-6**2 / 2.0, rtol=0.05, atol=1e-20)
     assert words_of((first, second), RATE) == '5.1 µm rms near 180 Hz, 1.7 µm rms near 87 Hz'
     assert words_of((Tone(0.087, np.eye(4) * 200e-12),), RATE) == '14 µm rms near 87 Hz'
     # What is within a twenty-fifth of the frequency belongs to it: 3 um at 312 Hz, of whose lobe 5/6 are within.
     wide = noise(1) + (9e-6 * tone(300.0) + 3e-6 * tone(312.0))[:, None] * (1.0, 0.0)
-    strongest = max(found(wide, noise(2)), key=rms_of)
+    strongest = max(moving_tones(wide, noise(2)), key=rms_of)
     assert TURN[0] @ strongest.covariance @ TURN[0] == pytest.approx((81.0 + 9.0 / 1.2) * 0.5e-12, rel=0.015)
 
 
@@ -72,19 +72,19 @@ def test_the_floor_of_a_tone_is_that_about_it() -> None:
     )
     moving = 1e-3 * np.fft.irfft(spectrum[0] + 1j * spectrum[1], axis=0)
     for hz, names in ((247.0, [247]), (197.0, [])):
-        assert [round(t.frequency * RATE) for t in found(moving + 2e-6 * tone(hz)[:, None], noise(2))] == names
+        assert [round(t.frequency * RATE) for t in moving_tones(moving + 2e-6 * tone(hz)[:, None], noise(2))] == names
 
 
 def test_a_tone_lasts_until_it_is_below_twelve_times_the_floor() -> None:
     """0.33 um are some 25 times the floor of a white noise of 1 um: too weak to be found, enough to be kept."""
-    for amplitude, hz, kept in ((0.33e-6, 87.0, 1), (0.33e-6, 93.0, 0), (0.1e-6, 87.0, 0), (0.33e-6, 90.0, 1)):
+    for amplitude, hz, count in ((0.33e-6, 87.0, 1), (0.33e-6, 93.0, 0), (0.1e-6, 87.0, 0), (0.33e-6, 90.0, 1)):
         moving = noise(1) + amplitude * tone(87.0)[:, None]
-        assert not found(moving, noise(2))
-        assert len(found(moving, noise(2), known=(hz / RATE,))) == kept
-    assert found(noise(1) + 0.55e-6 * tone(498.0)[:, None], noise(2))  # The last bin but one.
+        assert not moving_tones(moving, noise(2))
+        assert len(moving_tones(moving, noise(2), known=(hz / RATE,))) == count
+    assert moving_tones(noise(1) + 0.55e-6 * tone(498.0)[:, None], noise(2))  # The last bin but one.
     # A strong one elsewhere is found beside it.
     both = noise(1) + 0.33e-6 * tone(87.0)[:, None] + 3e-6 * tone(200.0)[:, None]
-    assert [round(t.frequency * RATE) for t in found(both, noise(2), known=(0.087,))] == [200, 87]
+    assert [round(t.frequency * RATE) for t in moving_tones(both, noise(2), known=(0.087,))] == [200, 87]
 
 
 def test_a_block_reports_the_tones_that_widen_it() -> None:
@@ -119,10 +119,10 @@ def test_a_weak_tone_below_a_cycle_a_block_is_covered(hz: float, size: float) ->
 @pytest.mark.parametrize('share', [0.15, 1.0])
 def test_hum_in_what_cannot_move_is_no_motion(share: float) -> None:
     moving = noise(1) + 5e-6 * tone(50.0)[:, None]
-    assert found(moving, noise(2))
-    assert not found(moving, noise(2) + share * 5e-6 * tone(50.0)[:, None])
+    assert moving_tones(moving, noise(2))
+    assert not moving_tones(moving, noise(2) + share * 5e-6 * tone(50.0)[:, None])
     # A sound rig leaks some of a motion into them.
-    assert found(moving, noise(2) + 0.05 * 5e-6 * tone(50.0)[:, None])
+    assert moving_tones(moving, noise(2) + 0.05 * 5e-6 * tone(50.0)[:, None])
 
 
 def test_hum_is_taken_off_with_its_phase_in_each_reading() -> None:
@@ -132,12 +132,12 @@ def test_hum_is_taken_off_with_its_phase_in_each_reading() -> None:
     # Beside a motion of a tenth of a millimetre at 14 Hz, with every seventh sample lost.
     plain = noise(3, 3) + 1e-4 * tone(14.0)[:, None] + 1e-3
     here = np.flatnonzero(ALL % 7 != 3)
-    rest, found = ToneSearch(SIZE, SEGMENT_BLOCKS).without(here, (plain + hum)[here], 0.0503)
-    np.testing.assert_allclose([found.cosine, found.sine], [cosine, sine], atol=3e-7)
+    rest, removed = ToneSearch(SIZE, SEGMENT_BLOCKS).without(here, (plain + hum)[here], 0.0503)
+    np.testing.assert_allclose([removed.cosine, removed.sine], [cosine, sine], atol=3e-7)
     assert np.abs(rest - plain[here]).max() < 6e-7
-    lags = found.autocovariance(SIZE)
-    own = np.stack([hum[:-SIZE].T @ hum[lag : lag - SIZE] for lag in range(SIZE)], axis=2) / (N - SIZE)
-    np.testing.assert_allclose(lags, own, atol=1.5e-12)
+    lags = removed.autocovariance(SIZE)
+    expected = np.stack([hum[:-SIZE].T @ hum[lag : lag - SIZE] for lag in range(SIZE)], axis=2) / (N - SIZE)
+    np.testing.assert_allclose(lags, expected, atol=1.5e-12)
 
 
 def band_noise(first: int, last: int, seed: int = 5) -> FloatArray:
@@ -151,15 +151,15 @@ def band_noise(first: int, last: int, seed: int = 5) -> FloatArray:
 def test_readings_that_vary_together_in_a_band_vibrate() -> None:
     readings, still = noise(1, 4), noise(2)
     together = np.array([2e-6, 0.0, 2e-6, 0.0])
-    search, turn = ToneSearch(SIZE, SEGMENT_BLOCKS), np.eye(4)
+    search, identity = ToneSearch(SIZE, SEGMENT_BLOCKS), np.eye(4)
     shaken = readings + band_noise(120, 155)[:, None] * together
 
     def of(dots: FloatArray, beside: FloatArray, known: tuple[float, ...] = ()) -> tuple[Tone, ...]:
-        return search.tones(ALL, dots, beside, turn, known).moving
+        return search.tones(ALL, dots, beside, identity, known).moving
 
-    (one,) = of(shaken, still)
-    assert one.frequency * RATE == pytest.approx(136.5, abs=25.0)
-    np.testing.assert_allclose(one.covariance, np.outer(together, together), atol=1.2e-12)
+    (band,) = of(shaken, still)
+    assert band.frequency * RATE == pytest.approx(136.5, abs=25.0)
+    np.testing.assert_allclose(band.covariance, np.outer(together, together), atol=1.2e-12)
     assert of(readings, still) == ()
     # Two readings of one PSD may have one supply, and so may all the electronics.
     assert of(readings + band_noise(120, 155)[:, None] * (2e-6, 2e-6, 0.0, 0.0), still) == ()
@@ -185,22 +185,22 @@ def test_hum_leaves_the_intervals_as_they_are(hz: float) -> None:
 
 def test_slow_motion_steps_and_regular_gaps_make_no_tone() -> None:
     slow = 1e-3 * np.stack((tone(14.0), np.where(ALL > 433, 1.0, -0.4)), axis=1)
-    assert not found(noise(1) + slow, noise(2))
+    assert not moving_tones(noise(1) + slow, noise(2))
     # Every tenth sample lost makes a tone of 100 Hz of any slow motion that is not bridged.
     here = np.flatnonzero(ALL % 10 != 3)
     ramp = 2e-2 * np.stack((ALL / N, (ALL / N) ** 2), axis=1)
-    assert not found((noise(1) + ramp)[here], noise(2)[here], here)
+    assert not moving_tones((noise(1) + ramp)[here], noise(2)[here], here)
 
 
 def test_too_short_segments_have_no_tones() -> None:
     assert ToneSearch(2, SEGMENT_BLOCKS).tones(ALL[:100], noise(1, 3, 100), noise(2, n=100), TURN) == Tones()
-    assert found(noise(1, n=1), noise(2, n=1), ALL[:1]) == ()
+    assert moving_tones(noise(1, n=1), noise(2, n=1), ALL[:1]) == ()
 
 
 def test_a_tone_with_gaps_is_no_smaller() -> None:
     here = np.sort(np.random.default_rng(3).choice(N, 800, replace=False))
-    (one,) = found((noise(1) + 5e-6 * tone(87.0)[:, None])[here], noise(2)[here], here)
-    assert 1.0 <= rms_of(one) / (5e-6 / 2.0**0.5 * np.abs(TURN.sum(axis=0)).max()) < 1.3
+    (measured,) = moving_tones((noise(1) + 5e-6 * tone(87.0)[:, None])[here], noise(2)[here], here)
+    assert 1.0 <= rms_of(measured) / (5e-6 / 2.0**0.5 * np.abs(TURN.sum(axis=0)).max()) < 1.3
 
 
 @pytest.mark.parametrize('lost', [(), (2, 3, 11, 12)])
@@ -227,8 +227,8 @@ def test_the_fit_states_what_it_leaves_of_a_tone(lost: tuple[int, ...]) -> None:
     np.testing.assert_allclose(stated, mean, rtol=1e-3, atol=1e-24)
 
 
-def records_of(clean: FloatArray, own: Rig, seed: int = 1, row: Row = ROWS[0]) -> list[Record]:
-    return list(Pipeline(own).process(chunk(volts_of(row, clean, seed))))
+def records_of(clean: FloatArray, rig: Rig, seed: int = 1, row: Row = ROWS[0]) -> list[Record]:
+    return list(Pipeline(rig).process(chunk(volts_of(row, clean, seed))))
 
 
 def chunk(volts: FloatArray, first: int = 0) -> RawChunk:
@@ -275,8 +275,8 @@ def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
 
 def test_the_filter_states_it_too() -> None:
     """The filtered pose and the velocity: 14 um and what 87 Hz makes of them."""
-    own = load_rig(overrides={'filter': 'modal'})
-    moved = [r for r in records_of(shaking(4), own) if isinstance(r, TipMotion)]
+    filtering = load_rig(overrides={'filter': 'modal'})
+    moved = [r for r in records_of(shaking(4), filtering) if isinstance(r, TipMotion)]
     last = moved[-1]
     pose, velocity = (np.sqrt(np.reshape(c, (3, 3))[1, 1]) for c in (last.covariance, last.velocity_covariance))
     size = 20e-6 / 2.0**0.5

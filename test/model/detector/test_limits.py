@@ -32,14 +32,14 @@ def classify(
     present: int = 20,
     flag: int = 0,
     frozen: tuple[int, int] = (0, 0),
-    one: tuple[float, ...] | None = None,
+    outlier: tuple[float, ...] | None = None,
     **overrides: object,
 ) -> Verdict:
-    """``one``: volts of a single sample of the block."""
+    """``outlier``: volts of a single sample of the block."""
     rig = load_rig(overrides={**overrides})
     rows = np.tile(np.array(volts, np.float32), (present, 1))
-    if one is not None:
-        rows[present // 2] = one
+    if outlier is not None:
+        rows[present // 2] = outlier
     flags = np.zeros(present, np.uint8)
     flags[3] = flag
     seq = np.arange(present)
@@ -58,13 +58,13 @@ def test_a_good_block_is_good() -> None:
 @pytest.mark.parametrize(('psd', 'channel'), [(1, 2), (2, 5)])
 def test_a_laser_is_lost_below_the_least_sum_even_in_one_sample(psd: int, channel: int) -> None:
     least = load_rig().estimator.sum_min
-    lost = classify(one=changed(channel, least - 0.001))
+    lost = classify(outlier=changed(channel, least - 0.001))
     assert (lost.status, lost.faulty, lost.faults) == (BlockStatus.LASER_LOST, psd, frozenset({psd}))
     assert lost.reason == f'laser {psd} lost: sum {least - 0.001:.3f} V, below {least:g} V'
-    assert classify(one=changed(channel, least + 0.001)).status is BlockStatus.OK
+    assert classify(outlier=changed(channel, least + 0.001)).status is BlockStatus.OK
     # Half of it if two lasers share the detectors.
-    assert classify(one=changed(channel, 0.5 * least + 0.001), splitter=True).status is BlockStatus.OK
-    assert classify(one=changed(channel, 0.5 * least - 0.001), splitter=True).faulty == psd
+    assert classify(outlier=changed(channel, 0.5 * least + 0.001), splitter=True).status is BlockStatus.OK
+    assert classify(outlier=changed(channel, 0.5 * least - 0.001), splitter=True).faulty == psd
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
@@ -73,10 +73,10 @@ def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, s
     if channel in (2, 5) and sign < 0.0:
         return
     name = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')[channel]
-    full = classify(one=changed(channel, sign * 32767 * STEP))
+    full = classify(outlier=changed(channel, sign * 32767 * STEP))
     assert (full.status, full.faulty) == (BlockStatus.SATURATED, 1 + channel // 3)
     assert full.reason == f'{name} saturated: 10.000 V, converter.full_scale is 10 V'
-    assert classify(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
+    assert classify(outlier=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
 
 
 def test_device_flag_blames_no_detector_without_cause() -> None:
@@ -126,11 +126,11 @@ def test_too_few_samples_leave_no_detector_to_go_on_with() -> None:
 
 
 def test_worst_cause_is_first_and_both_psds_are_faulty() -> None:
-    far = (1.0, 0.0, 1.25e-4, -1.25e-4)
-    both = classify(changed(5, 0.0), far)
+    off = (1.0, 0.0, 1.25e-4, -1.25e-4)
+    both = classify(changed(5, 0.0), off)
     assert (both.status, both.faulty, both.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1, 2}))
     assert both.reason.startswith('laser 2')
-    assert classify(changed(2, 0.0), far).reason.startswith('laser 1')
+    assert classify(changed(2, 0.0), off).reason.startswith('laser 1')
     assert classify(changed(3, 10.0), (*DOTS[:2], 1.0, 0.0)).status is BlockStatus.SATURATED
 
 
@@ -148,10 +148,10 @@ def test_half_the_light_on_both_is_one_laser_of_two(share: float, reported: bool
 def test_other_light_or_clipped_spot_names_detector() -> None:
     most = load_rig().estimator.sum_max
     for psd, channel in ((1, 2), (2, 5)):
-        assert classify(one=changed(channel, most + 0.01)).findings == (
+        assert classify(outlier=changed(channel, most + 0.01)).findings == (
             f'psd_{psd} sees other light: sum {most + 0.01:.3f} V, above {most:g} V',
         )
-        assert classify(one=changed(channel, most - 0.01)).findings == ()
+        assert classify(outlier=changed(channel, most - 0.01)).findings == ()
     area, radius = load_rig().psds[0].active_area, load_rig().psds[0].spot_radius
     for axis in range(4):
         edge = area[axis % 2] / 2.0 - radius
@@ -198,10 +198,10 @@ def test_noise_is_separated_at_five_times_rig_noise(channel: int, size: int) -> 
     for share, reported in ((0.99, 0), (1.01, 1)):
         volts = np.zeros((size, 6))
         volts[:, channel] = share * limit * np.sqrt(20.0) / 8.0 * (-1.0) ** np.arange(size)
-        found = OpticsHealth(rig).late_findings(
+        findings = OpticsHealth(rig).late_findings(
             of(volts.astype(np.float32)), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()
         )
-        assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * reported
+        assert findings == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * reported
 
 
 def test_nine_sample_blocks_and_gaps_report_no_noise() -> None:

@@ -107,8 +107,8 @@ def test_quadrant_volts_are_linear_like_lateral_ones() -> None:
     np.testing.assert_allclose(dots[0, 0], place, rtol=1e-6)
     np.testing.assert_allclose(dots[0, 1], 1e-3 * 0.1e-3, rtol=1e-6)
     np.testing.assert_allclose(dots[0, 2:], [reading * 0.1e-3, 1e-3 * 0.1e-3], rtol=1e-6)
-    beyond = calibration.dots(volts(9.0, 0.0, 5.0, 0.0, 0.0, 5.0))
-    np.testing.assert_allclose(beyond[0, 0], 1.5 * w, rtol=1e-9)
+    outside = calibration.dots(volts(9.0, 0.0, 5.0, 0.0, 0.0, 5.0))
+    np.testing.assert_allclose(outside[0, 0], 1.5 * w, rtol=1e-9)
 
 
 def test_electrodes_go_through_the_wiring_once() -> None:
@@ -139,19 +139,19 @@ def test_other_light_is_taken_off_as_photocurrents_add() -> None:
 
 def test_dots_without_dark_levels_or_laser_are_finite() -> None:
     nominal = rig_from_values({})
-    some = np.random.default_rng(1).uniform(-9.0, 9.0, (50, 6)).astype(np.float32)
+    drawn = np.random.default_rng(1).uniform(-9.0, 9.0, (50, 6)).astype(np.float32)
     no_light = VoltsToDots.from_rig(
         replace_values(nominal, {'psd_1.dark': [5.0, 5.0, 0.0], 'psd_2.dark': [1.0, 1.0, -0.1]})
     )
-    np.testing.assert_array_equal(no_light.dots(some), VoltsToDots.from_rig(nominal).dots(some))
-    one = VoltsToDots.from_rig(replace_values(nominal, {'psd_2.dark': [1.0, -1.0, 0.1]}))
-    np.testing.assert_array_equal(one.dots(some)[:, :2], VoltsToDots.from_rig(nominal).dots(some)[:, :2])
+    np.testing.assert_array_equal(no_light.dots(drawn), VoltsToDots.from_rig(nominal).dots(drawn))
+    psd_2_dark = VoltsToDots.from_rig(replace_values(nominal, {'psd_2.dark': [1.0, -1.0, 0.1]}))
+    np.testing.assert_array_equal(psd_2_dark.dots(drawn)[:, :2], VoltsToDots.from_rig(nominal).dots(drawn)[:, :2])
     # With the laser off what is left is noise, 2 mV of the sum and of x: no dot outside the active area.
     for noise in (-2e-3, 0.0, 2e-3):
-        assert np.abs(one.dots(volts(0.0, 0.0, 0.0, 1.0 - noise, -1.0, 0.1 + noise))).max() < 1e-3
+        assert np.abs(psd_2_dark.dots(volts(0.0, 0.0, 0.0, 1.0 - noise, -1.0, 0.1 + noise))).max() < 1e-3
     # The least light that is believed: a tenth of the other light.
-    np.testing.assert_allclose(one.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, 0.11))[0, 2:], [0.5e-3, 5e-3], rtol=1e-5)
-    assert np.isfinite(one.dots(np.zeros((1, 6), dtype=np.float32))).all()
+    np.testing.assert_allclose(psd_2_dark.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, 0.11))[0, 2:], [0.5e-3, 5e-3], rtol=1e-5)
+    assert np.isfinite(psd_2_dark.dots(np.zeros((1, 6), dtype=np.float32))).all()
 
 
 def test_a_place_is_valid_as_far_as_its_sensor_reaches() -> None:
@@ -287,8 +287,8 @@ def test_beyond_the_fold_the_inverse_is_a_straight_line(k: float) -> None:
     there = response.reading(np.array(0.6 * farthest), np.array(-0.8 * farthest))
     assert np.hypot(*there) == pytest.approx(0.7 * farthest)
     for times in (1.0, 1.01, 2.0, 100.0):
-        found = response.place(times * there[0], times * there[1])
-        assert found == pytest.approx((0.6 * times * farthest, -0.8 * times * farthest))
+        place = response.place(times * there[0], times * there[1])
+        assert place == pytest.approx((0.6 * times * farthest, -0.8 * times * farthest))
 
 
 @given(place, st.floats(0.0, 5.0), place)

@@ -173,18 +173,18 @@ def test_user_effect_is_calibrated_as_declared(tmp_path: Path, monkeypatch: pyte
     at = model.INDEX['psd_2.gain_x']
     assert vector.values[at] == 0.01
     # What a calibration finds goes into the effect that the file has; of others into the package's own.
-    found = vector.values.copy()
-    found[at] = 0.012
-    found[model.INDEX['psd_1.rotation']] = model.TOLERANCES[model.INDEX['psd_1.rotation']]
-    _, effects = rig_values(vector, found, vector.clamp)
-    own = [a for a in effects if 'psd' in a.values]
-    assert [(a.effect.name, a.values['psd']) for a in own] == [('sensor_rotation', 1.0), ('my_gain', 2.0)]
-    assert own[1].values['x'] == 0.012
+    values = vector.values.copy()
+    values[at] = 0.012
+    values[model.INDEX['psd_1.rotation']] = model.TOLERANCES[model.INDEX['psd_1.rotation']]
+    _, effects = rig_values(vector, values, vector.clamp)
+    of_psd = [a for a in effects if 'psd' in a.values]
+    assert [(a.effect.name, a.values['psd']) for a in of_psd] == [('sensor_rotation', 1.0), ('my_gain', 2.0)]
+    assert of_psd[1].values['x'] == 0.012
     dots = np.array([[0.0, 0.0, 1.01e-3, 0.0]])
     assert Correction.from_rig(rig).apply(dots)[0, 2] == pytest.approx(1e-3)
-    found[model.INDEX['psd_2.gain_y']] = 0.004
+    values[model.INDEX['psd_2.gain_y']] = 0.004
     for known, want in ((vector, ['my_gain', 'sensor_gain']), (vector_of_rig(RIG), ['sensor_gain'])):
-        _, effects = rig_values(known, found, vector.clamp)
+        _, effects = rig_values(known, values, vector.clamp)
         gains = [a for a in effects if a.effect.name.endswith('gain')]
         assert [a.effect.name for a in gains] == want
         assert gains[-1].values['y'] == 0.004
@@ -223,22 +223,22 @@ def test_wrong_user_effect_is_rejected_if_listed(tmp_path: Path, monkeypatch: py
     with pytest.raises(ConfigError, match=r'my_gain.py: holds no effect .*gian_x'):
         vector_of_rig(load_rig(overrides={'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}))
     vector = vector_of_rig(RIG)
-    found = vector.values.copy()
-    found[model.INDEX['psd_2.gain_x']] = 0.012
-    _, effects = rig_values(vector, found, vector.clamp)
+    values = vector.values.copy()
+    values[model.INDEX['psd_2.gain_x']] = 0.012
+    _, effects = rig_values(vector, values, vector.clamp)
     assert [a.effect.name for a in effects if 'psd' in a.values] == ['sensor_gain']
 
 
 def test_two_effects_that_give_one_parameter_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'my_gain.py').write_text(OWN)
     monkeypatch.setenv(FOLDERS, str(tmp_path))
-    own = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
+    user = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
     ours = {'effects.b.name': 'sensor_gain', 'effects.b.psd': 2}
     with pytest.raises(ConfigError, match=r'my_gain \(psd 2\) and sensor_gain \(psd 2\): both give psd_2.gain_x'):
-        vector_of_rig(load_rig(overrides={**own, **ours, 'effects.b.x': 0.01}))
+        vector_of_rig(load_rig(overrides={**user, **ours, 'effects.b.x': 0.01}))
     # They share no parameter: this one's x is off, or it is of the other PSD.
     for apart in ({'effects.b.y': 0.01}, {'effects.b.x': 0.01, 'effects.b.psd': 1}):
-        assert vector_of_rig(load_rig(overrides={**own, **ours, **apart})).values[model.INDEX['psd_2.gain_x']] == 0.01
+        assert vector_of_rig(load_rig(overrides={**user, **ours, **apart})).values[model.INDEX['psd_2.gain_x']] == 0.01
 
 
 def test_an_effect_listed_twice_is_rejected() -> None:
@@ -248,15 +248,15 @@ def test_an_effect_listed_twice_is_rejected() -> None:
         vector_of_rig(load_rig(overrides=twice))
 
 
-@pytest.mark.parametrize('found', [-0.006, 0.0, 0.3])
-def test_undetermined_slope_ratio_is_written_valid(found: float) -> None:
+@pytest.mark.parametrize('fitted', [-0.006, 0.0, 0.3])
+def test_undetermined_slope_ratio_is_written_valid(fitted: float) -> None:
     vector = vector_of_rig(RIG)
     p = vector.values.copy()
-    p[model.INDEX['link.slope_ratio']] = found
+    p[model.INDEX['link.slope_ratio']] = fitted
     values, effects = rig_values(vector, p, vector.clamp)
-    assert values['link.slope_ratio'] == max(found, 0.0)
+    assert values['link.slope_ratio'] == max(fitted, 0.0)
     tilts = [a.values['slope_ratio'] for a in effects if 'slope_ratio' in a.values]
-    assert tilts == ([found] if found > 0.0 else [])
+    assert tilts == ([fitted] if fitted > 0.0 else [])
     replace_values(RIG, values)
     # The caller's own numbers stay.
-    assert p[model.INDEX['link.slope_ratio']] == found
+    assert p[model.INDEX['link.slope_ratio']] == fitted

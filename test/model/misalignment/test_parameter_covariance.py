@@ -20,8 +20,8 @@ POSE = (1.5e-3, -2e-3, 0.015)
 
 def calibrated(**more: object) -> Rig:
     rest = [n for n in INDEX if n not in NAMES]
-    own = {'calibration.names': [*NAMES, *rest], 'calibration.sds': [*SDS, *([0.0] * len(rest))]}
-    return rig_from_values({**own, 'solvers': ['exact', 'wls', 'iterative', 'ols'], **more})
+    values = {'calibration.names': [*NAMES, *rest], 'calibration.sds': [*SDS, *([0.0] * len(rest))]}
+    return rig_from_values({**values, 'solvers': ['exact', 'wls', 'iterative', 'ols'], **more})
 
 
 def chunk_of(dots: FloatArray, first: int = 0) -> RawChunk:

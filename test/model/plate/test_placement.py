@@ -85,9 +85,9 @@ def test_the_search_beats_every_pair_of_a_finer_grid() -> None:
     base_square[base_square == 0.0] = 1e-12
     # var dX + var dY + (0.1 m)^2 var theta for sigma = 1, written out.
     costs = 1.0 + 2.0 / base_square * (np.sum(((first + second) / 2.0) ** 2, axis=-1) + 0.1**2)
-    found = float(placement.cost(np.array(placement.deviations_of_pair(pair, 1.0))))
-    assert found <= math.sqrt(float(np.min(costs)))
-    assert found == pytest.approx(math.sqrt(float(np.min(costs))), rel=0.02)
+    best = float(placement.cost(np.array(placement.deviations_of_pair(pair, 1.0))))
+    assert best <= math.sqrt(float(np.min(costs)))
+    assert best == pytest.approx(math.sqrt(float(np.min(costs))), rel=0.02)
 
 
 def test_the_search_finds_what_lies_between_its_candidates() -> None:

@@ -93,12 +93,12 @@ def test_beams_and_surfaces_of_any_direction(rays: Any) -> None:
     rolls, directions = [0.02, -0.01, 0.0], np.array([[0.01, 0.0, 1.0], [0.0, -0.02, 1.0], [0.005, 0.005, 1.0]])
     pose = POSES[0]
     expected = rays.tip_dots(STAGGERED, pose, directions=directions, rolls=rolls).reshape(3, 2)
-    own = rotation(np.array(rolls), 0.0, 0.0)
+    sensors = rotation(np.array(rolls), 0.0, 0.0)
     plate = rotation(*pose[2:])
     assert plate == pytest.approx(rays.rotation(*pose[2:]), abs=1e-15)
     centers = lifted(STAGGERED.centers, STAGGERED.heights)
-    start = centers + np.einsum('pij,pj->pi', own[..., :2], STAGGERED.zeros)
-    got = hit(start, directions, centers @ plate.T + [pose[0], pose[1], 0.0], plate @ own)
+    start = centers + np.einsum('pij,pj->pi', sensors[..., :2], STAGGERED.zeros)
+    got = hit(start, directions, centers @ plate.T + [pose[0], pose[1], 0.0], plate @ sensors)
     assert got == pytest.approx(expected, abs=1e-15)
 
 
@@ -165,8 +165,8 @@ def test_laser_on_plate_lands_where_ray_meets_surface(pose: np.ndarray, height: 
     for i in range(5):
         step = 1e-6 * np.eye(5)[i]
         moved = [tuple((pose + s).tolist()) for s in (step, -step)]
-        ahead, behind = (np.array(landing((*PLACE, height), p)[:2]) for p in moved)
-        assert (by_x[i], by_y[i]) == pytest.approx((ahead - behind) / 2e-6, abs=1e-9)
+        plus, minus = (np.array(landing((*PLACE, height), p)[:2]) for p in moved)
+        assert (by_x[i], by_y[i]) == pytest.approx((plus - minus) / 2e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize('height', [-0.05, 0.0, 0.04])

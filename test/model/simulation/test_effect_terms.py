@@ -135,10 +135,10 @@ def test_a_spot_at_the_edge_is_integrated(psd: int, profile: int, radius: float)
         for axis, half in enumerate((half_x, half_y)):
             place = before.dots[at + axis, i]
             low, high = max(-half - place, -reach), min(half - place, reach)
-            left = quad(across, low, high)[0]
-            moved = quad(lambda u: u * across(u), low, high)[0] / left
+            light = quad(across, low, high)[0]
+            moved = quad(lambda u: u * across(u), low, high)[0] / light
             assert after.dots[at + axis, i] == pytest.approx(place + moved, abs=1e-3 * radius)
-            share *= left / full
+            share *= light / full
         assert after.sums[psd - 1, i] == pytest.approx(before.sums[psd - 1, i] * share, rel=1e-3)
     other = 2 - at
     assert (after.dots[other : other + 2] == before.dots[other : other + 2]).all()
@@ -279,9 +279,9 @@ def test_a_second_mode_rings_as_its_equation_says(shares: int, phase: float) -> 
             def change(t: float, s: FloatArray, load: float = load) -> tuple[float, float]:
                 return float(s[1]), w * w * (load - float(s[0])) - 2.0 * zeta * w * float(s[1])
 
-            found = solve_ivp(change, (at, end), state, t_eval=[at + phase, end], rtol=1e-9, atol=1e-14)
-            out.append(float(found.y[0, 0]))
-            state, at = found.y[:, 1], end
+            solution = solve_ivp(change, (at, end), state, t_eval=[at + phase, end], rtol=1e-9, atol=1e-14)
+            out.append(float(solution.y[0, 0]))
+            state, at = solution.y[:, 1], end
         return out
 
     for row in range(2):
@@ -327,24 +327,24 @@ def test_half_a_loop_further_on_the_way_it_came(axis: int, rows: tuple[bool, ...
         def added(poses: list[tuple[float, float, float]], row: int = row, half: float = half) -> list[float]:
             """What the last block had added, in halves of the loop; nothing on another axis."""
             got = without_friction(width, axis, poses) - poses
-            others = [i for i in range(3) if i != row]
-            assert not got[:, others].any()
+            other_axes = [i for i in range(3) if i != row]
+            assert not got[:, other_axes].any()
             return [float(v) for v in (way * got[:, row] / half if half else got[:, row])]
 
-        one = 1.0 if sticks else 0.0
+        half_loop = 1.0 if sticks else 0.0
         # Below half of half a loop from rest it has not moved, above it has.
         assert added(at(0.0, 0.0, 0.49)) == pytest.approx([0.0, 0.0, 0.0])
-        assert added(at(0.0, 0.0, 0.51, 1.0, 4.0)) == pytest.approx([0.0, 0.0, one, one, one])
+        assert added(at(0.0, 0.0, 0.51, 1.0, 4.0)) == pytest.approx([0.0, 0.0, half_loop, half_loop, half_loop])
         # It came to rest at 5: a return to 4 is a way back. Without the rest it still is on its way from 0.
-        assert added(at(*[5.0] * 12, 4.0))[-1] == pytest.approx(-one)
-        assert added(at(*[5.0] * 11, 4.0))[-1] == pytest.approx(one)
+        assert added(at(*[5.0] * 12, 4.0))[-1] == pytest.approx(-half_loop)
+        assert added(at(*[5.0] * 11, 4.0))[-1] == pytest.approx(half_loop)
         # A rest that wanders by 0.45 is one; by 0.55 it is none.
-        assert added(at(*[5.0] * 6, *[5.45] * 6, 4.0))[-1] == pytest.approx(-one)
-        assert added(at(*[5.0] * 6, *[5.55] * 6, 4.0))[-1] == pytest.approx(one)
+        assert added(at(*[5.0] * 6, *[5.45] * 6, 4.0))[-1] == pytest.approx(-half_loop)
+        assert added(at(*[5.0] * 6, *[5.55] * 6, 4.0))[-1] == pytest.approx(half_loop)
         # At rest, moved by less than a quarter of the loop: as it came.
-        assert added(at(*[5.0] * 12, 4.7, 5.3))[-2:] == pytest.approx([one, one])
+        assert added(at(*[5.0] * 12, 4.7, 5.3))[-2:] == pytest.approx([half_loop, half_loop])
         # Back through where it rested first, and at rest there.
-        assert added(at(*[5.0] * 12, *[0.0] * 20, 0.3, 0.6))[-3:] == pytest.approx([-one, -one, one])
+        assert added(at(*[5.0] * 12, *[0.0] * 20, 0.3, 0.6))[-3:] == pytest.approx([-half_loop, -half_loop, half_loop])
 
 
 def test_a_link_sags_by_its_own_weight() -> None:

@@ -186,8 +186,8 @@ def wrenches(rig: Rig, volts: FloatArray) -> FloatArray:
         # What came before does not matter: the last three blocks of each load.
         seq = seq[seq % (1000 * HELD_S) >= 1000 * HELD_S - 60]
     chunk = RawChunk(seq, seq * 1_000_000, volts[seq].astype(np.float32), np.zeros(len(seq), np.uint8))
-    found = [(r.fx, r.fy, r.tz) for r in Pipeline(rig).process(chunk) if isinstance(r, TipLoad)]
-    return np.array(found)[len(found) // 3 * np.arange(1, 4) - 1]
+    loads = [(r.fx, r.fy, r.tz) for r in Pipeline(rig).process(chunk) if isinstance(r, TipLoad)]
+    return np.array(loads)[len(loads) // 3 * np.arange(1, 4) - 1]
 
 
 @pytest.mark.parametrize('active', STRONG)
@@ -199,9 +199,9 @@ def test_the_wrench_is_the_load(active: ActiveEffect) -> None:
         ForwardModel(load_rig(), effects).run(loads.steps(list(LOADS), HELD_S).loads).volts.T
         for effects in ([active], [])
     )
-    found, blind = wrenches(known, volts), wrenches(load_rig(overrides=calm), volts)
+    traced, blind = wrenches(known, volts), wrenches(load_rig(overrides=calm), volts)
     size = np.linalg.norm(LOADS, axis=1, keepdims=True)
-    assert (np.abs(found - LOADS) < 1e-3 * size).all()
+    assert (np.abs(traced - LOADS) < 1e-3 * size).all()
     moved = np.abs(volts[-1] - nominal[-1]).max() > 0.05
     assert not moved or (np.abs(blind - LOADS) > 1e-3 * size).any()
 
@@ -245,9 +245,9 @@ def test_the_simulated_dots_are_those_of_the_rays(rays: RayPlane) -> None:
     rig = load_rig(overrides=BASE)
     pose = np.array([1e-3, -2e-3, 0.015])
     physics = Physics.of(rig)
-    found = dots_on_plate(pose[:, None], physics.beams.reshape(4, 1), physics)[:, 0]
+    dots = dots_on_plate(pose[:, None], physics.beams.reshape(4, 1), physics)[:, 0]
     tilts = (1.5 * 2e-3 / 0.585, 1.5 * 1e-3 / 0.585)
-    np.testing.assert_allclose(found, rays.base_dots(Geometry.from_rig(rig), (*pose, *tilts)), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(dots, rays.base_dots(Geometry.from_rig(rig), (*pose, *tilts)), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -225,8 +225,8 @@ def test_a_joint_law_is_one_file(tmp_path: Path) -> None:
     rig = load_rig(
         overrides={'effects.both.law': effect_of(JOINT).law, 'effects.both.c1': 0.02, 'effects.both.c3': 0.2}
     )
-    (found,) = effects_of_rig(rig)
-    assert (len(found.parts), found.values['c1'], found.values['c3']) == (2, 0.02, 0.2)
+    (active,) = effects_of_rig(rig)
+    assert (len(active.parts), active.values['c1'], active.values['c3']) == (2, 0.02, 0.2)
 
 
 @pytest.mark.parametrize(

@@ -67,10 +67,10 @@ def test_dots_obey_the_contract_equation() -> None:
     rig = load_rig()
     samples = ForwardModel(rig).run(loads.identification().loads)
     for i, (c, m) in enumerate(zip(rig.centers, (samples.dots[:2], samples.dots[2:]), strict=True)):
-        turn = np.array(
+        rotations = np.array(
             [[np.cos(samples.pose[2]), -np.sin(samples.pose[2])], [np.sin(samples.pose[2]), np.cos(samples.pose[2])]]
         )
-        back = np.einsum('ijn,jn->in', turn, np.asarray(c)[:, None] + m) + samples.pose[:2]
+        back = np.einsum('ijn,jn->in', rotations, np.asarray(c)[:, None] + m) + samples.pose[:2]
         np.testing.assert_allclose(back, np.tile(np.asarray(c)[:, None], back.shape[1]), atol=1e-15, err_msg=str(i))
 
 
@@ -166,8 +166,8 @@ def test_a_delay_is_exact_just_after_a_load_step_too(delay: float) -> None:
     at = np.arange(0, fine.shape[1] - 40, FINER)
     expected = fine[:, at]
     expected[3:] = fine[3:, np.maximum(at - round(delay * 1e3 * FINER), 0)]
-    found = effect_volts(make_active('channel_skew', {'psd': 2, 'delay': delay}, 'test'))
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10)
+    delayed = effect_volts(make_active('channel_skew', {'psd': 2, 'delay': delay}, 'test'))
+    np.testing.assert_allclose(delayed, expected, rtol=0.0, atol=1e-10)
     assert np.abs(expected - fine[:, at]).max() > 1e-2
 
 
@@ -192,8 +192,8 @@ def lagged(fine: FloatArray, tau: float) -> FloatArray:
         kernel = 0.5 * end * weights * 1e-3 / tau * np.exp(-1e-3 / tau * (end - s))
         basis = np.array([np.prod([(s - b) / (a - b) for b in places if b != a], axis=0) for a in places])
         for start in range(0, fine.shape[1] - 1, FINER):
-            kept = np.exp(-1e-3 / tau * end) * out[:, start]
-            out[:, start + step] = kept + fine[:, start : start + FINER + 1] @ basis @ kernel
+            decayed = np.exp(-1e-3 / tau * end) * out[:, start]
+            out[:, start + step] = decayed + fine[:, start : start + FINER + 1] @ basis @ kernel
     return out
 
 

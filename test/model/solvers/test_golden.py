@@ -43,10 +43,10 @@ RAW_METHODS: list[tuple[str, dict[str, Any], str]] = [
 def check(golden: Any, case: str, method: str, options: dict[str, Any], want: Any) -> None:
     solver = make_solver(method, golden.geometry(case), **options)
     dots = golden.dots(case)
-    one = solver.solve(dots, EQUAL)
+    solution = solver.solve(dots, EQUAL)
     many = solver.solve_many(np.array([dots, dots]), np.array(EQUAL))
-    assert one.status is SolverStatus.OK
-    np.testing.assert_allclose([one.dx, one.dy, one.theta], want, rtol=0.0, atol=1e-9)
+    assert solution.status is SolverStatus.OK
+    np.testing.assert_allclose([solution.dx, solution.dy, solution.theta], want, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(many.pose, [want, want], rtol=0.0, atol=1e-9)
     assert many.status.tolist() == [0, 0]
 
@@ -74,13 +74,13 @@ def test_appendix_d_branch_and_all(golden: Any, case: str) -> None:
     assert got.angle_of_twist == want[2]
     np.testing.assert_allclose(got[:3], want, rtol=0.0, atol=1e-9)
     solver = make_solver('appendix_d', geometry)
-    one = solver.solve(dots, EQUAL)
+    solution = solver.solve(dots, EQUAL)
     many = solver.solve_many(np.array([dots]), np.array(EQUAL))
     pose = np.array(want) * (1e-3, 1e-3, -np.pi / 180.0)
-    np.testing.assert_allclose(one[:3], pose, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(solution[:3], pose, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(many.pose[0], pose, rtol=0.0, atol=1e-12)
     hit = SolverStatus.NO_HIT if got.branch == 'none' else SolverStatus.OK
-    assert one.status is hit
+    assert solution.status is hit
     assert many.status[0] == hit
 
 
@@ -108,8 +108,8 @@ def test_readings_of_the_simulator_with_all_effects(golden: Any, rays: Any) -> N
 
 @pytest.mark.parametrize('case', CASES)
 def test_minimum_tilt(golden: Any, case: str) -> None:
-    one = make_solver('minimum_tilt', golden.geometry(case)).solve(golden.dots(case), EQUAL)
-    beta = np.arccos(np.cos(one.phi) * np.cos(one.omega))
+    solution = make_solver('minimum_tilt', golden.geometry(case)).solve(golden.dots(case), EQUAL)
+    beta = np.arccos(np.cos(solution.phi) * np.cos(solution.omega))
     want = golden.cases[case]['min_tilt_beta']
     # An arccosine near 1 turns the last digit of a length into 1.5e-8 rad.
     assert abs(beta - want) < (1e-9 if want > 1e-6 else 3e-8)
@@ -117,9 +117,9 @@ def test_minimum_tilt(golden: Any, case: str) -> None:
 
 def test_covariance_of_beam(golden: Any) -> None:
     solver = make_solver('beam', golden.geometry('G5'))
-    one = solver.solve(golden.dots('G5'), EQUAL)
+    solution = solver.solve(golden.dots('G5'), EQUAL)
     want = golden.constants['cov_beam_G5_2um']
-    np.testing.assert_allclose(np.reshape(one.covariance, (3, 3)), want, rtol=1e-8)
+    np.testing.assert_allclose(np.reshape(solution.covariance, (3, 3)), want, rtol=1e-8)
 
 
 @pytest.mark.parametrize('theta_deg', [0.5, 1.0, 2.0, 3.0])

@@ -57,23 +57,23 @@ def agree(solver: Any, dots: np.ndarray[Any, Any], variances: tuple[float, ...],
     for name in ('pose', 'tilt', 'covariance', 'residual', 'status'):
         np.testing.assert_allclose(getattr(many, name), getattr(shared, name), rtol=1e-12, atol=1e-18)
     for i in range(count):
-        one = solver.solve(tuple(dots[i].tolist()), variances)
-        np.testing.assert_allclose([one.dx, one.dy, one.theta], many.pose[i], rtol=0, atol=atol)
-        np.testing.assert_allclose([one.phi, one.omega], many.tilt[i], rtol=0, atol=10 * atol)
+        single = solver.solve(tuple(dots[i].tolist()), variances)
+        np.testing.assert_allclose([single.dx, single.dy, single.theta], many.pose[i], rtol=0, atol=atol)
+        np.testing.assert_allclose([single.phi, single.omega], many.tilt[i], rtol=0, atol=10 * atol)
         scale = np.sqrt(np.diag(many.covariance[i]))
         scale = np.where(scale > 0.0, scale, 1.0)
         np.testing.assert_allclose(
-            np.reshape(one.covariance, (3, 3)) / np.outer(scale, scale),
+            np.reshape(single.covariance, (3, 3)) / np.outer(scale, scale),
             many.covariance[i] / np.outer(scale, scale),
             rtol=0,
             atol=1e-9,
         )
-        np.testing.assert_allclose(one.residual, many.residual[i], rtol=0, atol=atol)
-        assert int(one.status) == many.status[i]
-        assert type(one.status) is SolverStatus
-        assert all(type(v) is float for v in (*one[:5], *one.covariance, *one.residual))
+        np.testing.assert_allclose(single.residual, many.residual[i], rtol=0, atol=atol)
+        assert int(single.status) == many.status[i]
+        assert type(single.status) is SolverStatus
+        assert all(type(v) is float for v in (*single[:5], *single.covariance, *single.residual))
         again = solver.solve(tuple(dots[i].tolist()), variances)
-        np.testing.assert_array_equal(np.array(again[:5]), np.array(one[:5]))
+        np.testing.assert_array_equal(np.array(again[:5]), np.array(single[:5]))
 
 
 @pytest.mark.slow
@@ -114,11 +114,11 @@ def test_one_block_and_many_have_the_same_bits(method: str, psds: int) -> None:
     for variances in ((4e-12,) * 2 * psds, tuple((rng.uniform(1.0, 9.0, 2 * psds) * 1e-12).tolist())):
         many = solver.solve_many(dots, np.array(variances))
         gains = solver.gain_many(dots[:-1], variances, solver.solve_many(dots[:-1], np.array(variances)))
-        for i, (own, row) in enumerate(zip(dots.tolist(), many.rows(), strict=True)):
-            one = solver.solve(tuple(own), variances)
-            assert repr(one._replace(iterations=0)) == repr(row)
+        for i, (block, row) in enumerate(zip(dots.tolist(), many.rows(), strict=True)):
+            single = solver.solve(tuple(block), variances)
+            assert repr(single._replace(iterations=0)) == repr(row)
             if i < 29:
-                np.testing.assert_array_equal(solver.gain(tuple(own), variances, one), gains[i])
+                np.testing.assert_array_equal(solver.gain(tuple(block), variances, single), gains[i])
 
 
 @pytest.mark.parametrize(('method', 'options'), SMOOTH)
@@ -142,13 +142,13 @@ def test_one_block_and_many_agree_at_the_base(rays: Any, assume: str) -> None:
 
 @pytest.mark.parametrize(('method', 'options'), STEPPED)
 def test_a_threshold_claims_no_covariance(golden: Any, method: str, options: dict[str, Any]) -> None:
-    one = make_solver(method, golden.geometry(), **options).solve(golden.dots('G4'), VARIANCES['equal'])
-    assert np.isnan(one.covariance).all()
+    solution = make_solver(method, golden.geometry(), **options).solve(golden.dots('G4'), VARIANCES['equal'])
+    assert np.isnan(solution.covariance).all()
 
 
 def test_no_hit_is_no_measurement(golden: Any) -> None:
-    far = (5e-3, 0.0, 0.0, -9e-3)
-    printed = make_solver('iterative_printed', golden.geometry(), criterion='absolute').solve(far, VARIANCES['equal'])
+    miss = (5e-3, 0.0, 0.0, -9e-3)
+    printed = make_solver('iterative_printed', golden.geometry(), criterion='absolute').solve(miss, VARIANCES['equal'])
     assert printed.status is SolverStatus.NO_HIT
     assert np.isnan(printed[:3]).all()
     code = make_solver('appendix_d', golden.geometry()).solve(golden.dots('G3'), VARIANCES['equal'])
@@ -162,11 +162,11 @@ def test_a_base_line_too_short_for_any_tilt_is_inadmissible(golden: Any) -> None
     solver = make_solver('minimum_tilt', golden.geometry())
     for scale, status in ((1.0, SolverStatus.INADMISSIBLE), (0.1, SolverStatus.OK)):
         dots = (-scale * shrink[0], -scale * shrink[1], 0.0, 0.0)
-        one = solver.solve(dots, VARIANCES['equal'])
+        solution = solver.solve(dots, VARIANCES['equal'])
         many = solver.solve_many(np.array([dots]), np.array(VARIANCES['equal']))
-        assert one.status is status
+        assert solution.status is status
         assert many.status[0] == status
-        assert one.phi == one.omega == 0.0
+        assert solution.phi == solution.omega == 0.0
 
 
 def test_an_unknown_method_is_rejected_with_the_known_ones(golden: Any) -> None:
@@ -223,9 +223,9 @@ def test_a_dot_that_is_no_number_has_no_status_ok(golden: Any, method: str, opti
     assert solver.solve(bad, VARIANCES['equal']).status != 0
     many = solver.solve_many(np.array([good, bad, good]), np.array(VARIANCES['equal']))
     assert many.status[1] != 0
-    one = solver.solve(good, VARIANCES['equal'])
-    np.testing.assert_allclose(many.pose[[0, 2]], [one[:3], one[:3]], rtol=0, atol=1e-14)
-    assert many.status[[0, 2]].tolist() == [one.status] * 2
+    single = solver.solve(good, VARIANCES['equal'])
+    np.testing.assert_allclose(many.pose[[0, 2]], [single[:3], single[:3]], rtol=0, atol=1e-14)
+    assert many.status[[0, 2]].tolist() == [single.status] * 2
 
 
 def curve(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
@@ -243,19 +243,19 @@ def line(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
 
 def test_a_curve_is_fitted_with_its_covariance() -> None:
     measured, _ = curve((2.0, 0.3))
-    one = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
-    assert one.converged
-    np.testing.assert_allclose(one.parameters, (2.0, 0.3), atol=1e-12)
+    fitted = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
+    assert fitted.converged
+    np.testing.assert_allclose(fitted.parameters, (2.0, 0.3), atol=1e-12)
     _, rows = curve((2.0, 0.3))
     j = np.array(rows)
     want = np.linalg.inv(j.T @ np.diag([100.0, 25.0, 50.0]) @ j)
-    np.testing.assert_allclose(one.covariance, want, rtol=1e-9)
+    np.testing.assert_allclose(fitted.covariance, want, rtol=1e-9)
 
 
 def test_what_cannot_be_observed_is_not_converged() -> None:
-    one = fit(line, (0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
-    assert not one.converged
-    assert np.isnan(one.covariance).all()
+    fitted = fit(line, (0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
+    assert not fitted.converged
+    assert np.isnan(fitted.covariance).all()
 
 
 @pytest.mark.parametrize(('slope', 'reading', 'steps'), [(1.0, 1.0, MAX_STEPS), (1e-150, 1e160, 1)])
@@ -265,20 +265,20 @@ def test_steps_without_an_end_end(slope: float, reading: float, steps: int) -> N
     def away(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         return [0.0], [(slope,)]
 
-    one = fit(away, (0.0,), (reading,), (1.0,))
-    assert not one.converged
-    assert (one.steps, MAX_STEPS) == (steps, 50)
+    fitted = fit(away, (0.0,), (reading,), (1.0,))
+    assert not fitted.converged
+    assert (fitted.steps, MAX_STEPS) == (steps, 50)
 
 
 def test_the_residual_is_that_at_the_answer_to_the_last_digit() -> None:
     """Readings that no curve explains: each step is a share of the one before, and the last one still counts."""
     on, _ = curve((2.0, 0.3))
     measured = [a + b for a, b in zip(on, (0.9, -0.7, 0.8), strict=True)]
-    one = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
-    assert one.converged
-    assert one.steps > 5
-    want = np.array(measured) - curve(one.parameters)[0]
-    np.testing.assert_allclose(one.residual, want, rtol=0.0, atol=2e-15)
+    fitted = fit(curve, (1.5, 0.2), measured, (0.01, 0.04, 0.02))
+    assert fitted.converged
+    assert fitted.steps > 5
+    want = np.array(measured) - curve(fitted.parameters)[0]
+    np.testing.assert_allclose(fitted.residual, want, rtol=0.0, atol=2e-15)
 
 
 def test_an_answer_takes_the_first_three_of_five() -> None:

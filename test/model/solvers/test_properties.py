@@ -53,12 +53,12 @@ def test_a_flat_pose_comes_back(
 ) -> None:
     dots = rays.tip_dots(geometry, (*pose, 0.0, 0.0))
     solver = make_solver(method, geometry, **options)
-    one = solver.solve(tuple(dots.tolist()), variances)
+    solution = solver.solve(tuple(dots.tolist()), variances)
     # The thesis's weights of rigs that they were not made for can be near singular: digits go with that.
     digits = 1.0 if options == {} else 10.0
-    np.testing.assert_allclose(one[:3], pose, rtol=0.0, atol=1e-9 * digits)
+    np.testing.assert_allclose(solution[:3], pose, rtol=0.0, atol=1e-9 * digits)
     np.testing.assert_allclose(solver.solve_many(dots[None], np.array(variances)).pose[0], pose, atol=1e-9 * digits)
-    assert one.status is SolverStatus.OK
+    assert solution.status is SolverStatus.OK
 
 
 @pytest.mark.parametrize('method', ['ols', 'wls'])
@@ -85,23 +85,23 @@ def test_a_cantilevers_pose_comes_back_with_its_tilts(
     tie = geometry.slope_ratio / L
     tilt = (-tie * pose[1], tie * pose[0])
     dots = rays.tip_dots(geometry, (*pose, *tilt))
-    one = make_solver('beam', geometry).solve(tuple(dots.tolist()), UNEQUAL)
-    close(one[:5], (*pose, *tilt))
-    assert one.status is SolverStatus.OK
-    assert one.iterations <= 6
+    solution = make_solver('beam', geometry).solve(tuple(dots.tolist()), UNEQUAL)
+    close(solution[:5], (*pose, *tilt))
+    assert solution.status is SolverStatus.OK
+    assert solution.iterations <= 6
 
 
 @many
 @given(pose=poses, tilt=tilts, distance=st.floats(0.05, 0.15), step=st.floats(0.02, 0.1))
 def test_three_staggered_psds_see_the_tilts(rays: Any, pose: Any, tilt: Any, distance: float, step: float) -> None:
-    turns = np.radians([0.0, 120.0, 240.0])
-    centers = distance * np.column_stack((np.cos(turns), np.sin(turns)))
+    angles = np.radians([0.0, 120.0, 240.0])
+    centers = distance * np.column_stack((np.cos(angles), np.sin(angles)))
     geometry = Geometry(centers, np.full((3, 2), 1e-4), np.array([step, -step, -step / 2]), L)
     dots = rays.tip_dots(geometry, (*pose, *tilt))
     variances = (*UNEQUAL, 3e-12, 5e-12)
     solver = make_solver('pose', geometry)
-    one = solver.solve(tuple(dots.tolist()), variances)
-    close(one[:5], (*pose, *tilt))
+    solution = solver.solve(tuple(dots.tolist()), variances)
+    close(solution[:5], (*pose, *tilt))
     all_at_once = solver.solve_many(dots[None], np.array(variances))
     close([*all_at_once.pose[0], *all_at_once.tilt[0]], (*pose, *tilt))
 
@@ -111,8 +111,8 @@ def test_three_staggered_psds_see_the_tilts(rays: Any, pose: Any, tilt: Any, dis
 def test_two_planes_at_the_base_see_tilts_without_twist(rays: Any, pose: Any, tilt: Any, planes: Any) -> None:
     geometry = Geometry(np.array([[0.0, 0.07], [-0.1, 0.0]]), np.full((2, 2), 1e-4), -np.array(planes), L)
     dots = rays.base_dots(geometry, (pose[0], pose[1], 0.0, *tilt))
-    one = make_solver('base_pair', geometry, assume='no_twist').solve(tuple(dots.tolist()), UNEQUAL)
-    close(one[:5], (pose[0], pose[1], 0.0, *tilt))
+    solution = make_solver('base_pair', geometry, assume='no_twist').solve(tuple(dots.tolist()), UNEQUAL)
+    close(solution[:5], (pose[0], pose[1], 0.0, *tilt))
 
 
 @many
@@ -123,8 +123,8 @@ def test_the_base_pair_sees_twist_when_the_link_is_a_beam(rays: Any, pose: Any, 
     assume(np.abs(gain).max() > 0.1)
     tilt = (-k * pose[1] / L, k * pose[0] / L)
     dots = rays.base_dots(geometry, (*pose, *tilt))
-    one = make_solver('base_pair', geometry).solve(tuple(dots.tolist()), UNEQUAL)
-    close(one[:5], (*pose, *tilt))
+    solution = make_solver('base_pair', geometry).solve(tuple(dots.tolist()), UNEQUAL)
+    close(solution[:5], (*pose, *tilt))
 
 
 def test_section_5_3_in_numbers(rays: Any) -> None:
@@ -206,15 +206,15 @@ def test_a_half_turn_and_a_mirror_of_the_beams_rig(
 def test_minimum_tilt_explains_dots_with_least_tilt(golden: Any, rays: Any, pose: Any, tilt: Any) -> None:
     geometry = golden.geometry()
     dots = rays.tip_dots(geometry, (*pose, *tilt))
-    one = make_solver('minimum_tilt', geometry).solve(tuple(dots.tolist()), ISOTROPIC)
-    lean = np.arccos(np.cos(one.phi) * np.cos(one.omega))
+    solution = make_solver('minimum_tilt', geometry).solve(tuple(dots.tolist()), ISOTROPIC)
+    lean = np.arccos(np.cos(solution.phi) * np.cos(solution.omega))
     assert lean <= np.arccos(np.cos(tilt[0]) * np.cos(tilt[1])) + 1e-7
     # The plate at the published pose has these very dots.
-    r = rays.rotation(one.theta, one.phi, one.omega)
-    np.testing.assert_allclose(rays.tip_dots(geometry, one[:5]), dots, rtol=0.0, atol=1e-9)
+    r = rays.rotation(solution.theta, solution.phi, solution.omega)
+    np.testing.assert_allclose(rays.tip_dots(geometry, solution[:5]), dots, rtol=0.0, atol=1e-9)
     azimuth = make_solver('minimum_tilt', geometry, angles='azimuth').solve(tuple(dots.tolist()), ISOTROPIC)
-    assert azimuth[:2] + azimuth[3:5] == one[:2] + one[3:5]
+    assert azimuth[:2] + azimuth[3:5] == solution[:2] + solution[3:5]
     quaternion = Rotation.from_matrix(r).as_quat()
     assert azimuth.theta == pytest.approx(2.0 * np.arctan2(quaternion[2], quaternion[3]), abs=1e-9)
     for i, q in enumerate(geometry.centers + dots.reshape(2, 2)):
-        np.testing.assert_allclose(r[:2, :2] @ q + one[:2], geometry.beams[i], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(r[:2, :2] @ q + solution[:2], geometry.beams[i], rtol=0.0, atol=1e-9)

@@ -81,14 +81,14 @@ def checked(solver: Solver, dots: Array, covariance_within: float, gain_within: 
     """Covariance against K V K^T and the stated gain against K, each in units of its own size."""
     variances = np.array(VARIANCES[: len(dots)])
     gain = by_differences(solver, dots, variances)
-    one = solver.solve(tuple(dots.tolist()), tuple(variances.tolist()))
-    assert one.status is SolverStatus.OK
+    solution = solver.solve(tuple(dots.tolist()), tuple(variances.tolist()))
+    assert solution.status is SolverStatus.OK
     want = gain * variances @ gain.T
     sd = np.sqrt(np.maximum(np.diag(want), 1e-24))
-    stated = np.reshape(one.covariance, (3, 3))
+    stated = np.reshape(solution.covariance, (3, 3))
     np.testing.assert_allclose(stated / np.outer(sd, sd), want / np.outer(sd, sd), rtol=0.0, atol=covariance_within)
     size = np.abs(gain).max(axis=1, keepdims=True) + 1e-9
-    of_dots = solver.gain(tuple(dots.tolist()), tuple(variances.tolist()), one)
+    of_dots = solver.gain(tuple(dots.tolist()), tuple(variances.tolist()), solution)
     np.testing.assert_allclose(of_dots / size, gain / size, rtol=0.0, atol=gain_within)
 
 
@@ -145,16 +145,16 @@ def test_residual_is_dots_minus_plate_at_answer(rays: Any, method: str, geometry
     variances = VARIANCES[: 2 * len(geometry.centers)]
     off = np.random.default_rng(8).normal(size=len(variances)) * 1e-4
     dots = rays.tip_dots(geometry, (2e-3, -1e-3, 0.04, 0.0, 0.0)) + off
-    one = make_solver(method, geometry).solve(tuple(dots.tolist()), variances)
-    np.testing.assert_allclose(one.residual, dots - rays.tip_dots(geometry, one[:5]), rtol=0.0, atol=1e-14)
-    assert np.abs(one.residual).max() > 1e-5
+    solution = make_solver(method, geometry).solve(tuple(dots.tolist()), variances)
+    np.testing.assert_allclose(solution.residual, dots - rays.tip_dots(geometry, solution[:5]), rtol=0.0, atol=1e-14)
+    assert np.abs(solution.residual).max() > 1e-5
 
 
 @pytest.mark.parametrize(('method', 'tries'), [('exact', 30), ('iterative', 50)])
 def test_what_never_ends_is_given_up(method: str, tries: int) -> None:
-    one = make_solver(method, SKEW).solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4])
-    assert one.status is SolverStatus.NOT_CONVERGED
-    assert one.iterations == tries
+    solution = make_solver(method, SKEW).solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4])
+    assert solution.status is SolverStatus.NOT_CONVERGED
+    assert solution.iterations == tries
 
 
 def test_newton_converges_fast_on_inconsistent_dots() -> None:
@@ -162,9 +162,9 @@ def test_newton_converges_fast_on_inconsistent_dots() -> None:
     variances = np.array([1e-12, 9e-10, 4e-12, 1e-10])
     dots = np.array([0.02, -0.03, -0.025, 0.03])
     many = make_solver('exact', SKEW)
-    one = many.solve(tuple(dots.tolist()), tuple(variances.tolist()))
-    assert one.status is SolverStatus.OK
-    assert one.iterations <= 6, one
+    solution = many.solve(tuple(dots.tolist()), tuple(variances.tolist()))
+    assert solution.status is SolverStatus.OK
+    assert solution.iterations <= 6, solution
     q, pairs = SKEW.centers + dots.reshape(2, 2), variances.reshape(2, 2)
 
     def cost(theta: Array) -> Array:
@@ -175,8 +175,8 @@ def test_newton_converges_fast_on_inconsistent_dots() -> None:
         return np.asarray(off_x**2 / pairs[:, 0].sum() + off_y**2 / pairs[:, 1].sum())
 
     angles = np.linspace(-np.pi, np.pi, 200_001)
-    assert one.theta == pytest.approx(float(angles[np.argmin(cost(angles))]), abs=4e-5)
-    assert many.solve_many(dots[None], variances).pose[0] == pytest.approx(one[:3], abs=1e-13)
+    assert solution.theta == pytest.approx(float(angles[np.argmin(cost(angles))]), abs=4e-5)
+    assert many.solve_many(dots[None], variances).pose[0] == pytest.approx(solution[:3], abs=1e-13)
 
 
 def test_dots_that_lie_on_one_another_turn_nothing() -> None:
@@ -199,10 +199,10 @@ def test_of_many_blocks_each_has_its_own_variances(rays: Any, method: str, count
     solver = make_solver(method, SKEW)
     many = solver.solve_many(dots, variances)
     for i in {0, 1, count - 2, count - 1}:
-        one = solver.solve(tuple(dots[i].tolist()), tuple(variances[i].tolist()))
-        np.testing.assert_allclose(many.pose[i], one[:3], rtol=0.0, atol=1e-13)
-        np.testing.assert_allclose(many.covariance[i].ravel(), one.covariance, rtol=1e-9, atol=1e-22)
-        np.testing.assert_allclose(many.residual[i], one.residual, rtol=0.0, atol=1e-14)
+        solution = solver.solve(tuple(dots[i].tolist()), tuple(variances[i].tolist()))
+        np.testing.assert_allclose(many.pose[i], solution[:3], rtol=0.0, atol=1e-13)
+        np.testing.assert_allclose(many.covariance[i].ravel(), solution.covariance, rtol=1e-9, atol=1e-22)
+        np.testing.assert_allclose(many.residual[i], solution.residual, rtol=0.0, atol=1e-14)
     assert not many.tilt.any()
 
 
@@ -216,12 +216,12 @@ def of_three(**values: Any) -> Any:
 
 def test_two_of_three_psds_allow_for_unobserved_tilt(rays: Any) -> None:
     """The middle between no tilt and a cantilever's, by least squares, and the way to either end as one more error."""
-    rig, kept = of_three(), [0, 2]
-    geometry = geometry_of(rig, kept)
-    np.testing.assert_array_equal(geometry.centers, THREE.centers[kept])
-    np.testing.assert_array_equal(geometry.zeros, THREE.zeros[kept])
-    np.testing.assert_array_equal(geometry.heights, THREE.heights[kept])
-    solver = subset_solver('pose', rig, kept)
+    rig, subset = of_three(), [0, 2]
+    geometry = geometry_of(rig, subset)
+    np.testing.assert_array_equal(geometry.centers, THREE.centers[subset])
+    np.testing.assert_array_equal(geometry.zeros, THREE.zeros[subset])
+    np.testing.assert_array_equal(geometry.heights, THREE.heights[subset])
+    solver = subset_solver('pose', rig, subset)
     assert solver is not None
     variances = np.array(VARIANCES[:4])
     dots = np.asarray(rays.tip_dots(geometry, tied(geometry, (2e-3, -3e-3, 0.02)))) + np.array(
@@ -257,10 +257,10 @@ def test_who_can_do_with_fewer_psds() -> None:
     """Every method that needs no third; minimum_tilt takes two at height 0 and no others; one PSD gives no twist."""
     rig = of_three()
     for name in ('exact', 'beam', 'wls', 'ols', 'iterative', 'wls_exact'):
-        some = subset_solver(name, rig, [1, 2])
-        assert some is not None
-        assert some.name == name
-        assert some.allowance((0.0,) * 4, VARIANCES[:4]) is None
+        pair = subset_solver(name, rig, [1, 2])
+        assert pair is not None
+        assert pair.name == name
+        assert pair.allowance((0.0,) * 4, VARIANCES[:4]) is None
     assert subset_solver('minimum_tilt', rig, [1, 2]) is None
     assert subset_solver('pose', rig, [1]) is None
     assert subset_solver('exact', rig, [1]) is None
@@ -278,11 +278,11 @@ def test_where_the_psds_are_is_reported_once() -> None:
     check_arrangement(rig_from_values({**base, 'degraded': 'none'}))
     with pytest.raises(ConfigError, match='one PSD at the base gives no pose'):
         check_arrangement(rig_from_values({**base, 'degraded': 'hold'}))
-    for values, others in (
+    for values, names in (
         ({**base, 'solvers': ['base_pair', 'wls']}, 'wls'),
         ({'solvers': ['base_pair']}, 'base_pair'),
     ):
-        with pytest.raises(ConfigError, match=f'; {others} of solvers have not'):
+        with pytest.raises(ConfigError, match=f'; {names} of solvers have not'):
             check_arrangement(rig_from_values({**values, 'degraded': 'none'}))
 
 
@@ -317,10 +317,10 @@ def test_options_come_from_the_rig_file() -> None:
     assert message == make_solver('base_pair', Geometry.from_rig(rig), assume='no_twist').solve(dots, VARIANCES[:4])
     assert message != make_solver('base_pair', Geometry.from_rig(rig)).solve(dots, VARIANCES[:4])
     rig = rig_from_values({'minimum_tilt.angles': 'azimuth'})
-    far = (1e-3, 2e-3, -1e-3, -3e-3)
-    message = solver_from_rig('minimum_tilt', rig).solve(far, VARIANCES[:4])
-    assert message == make_solver('minimum_tilt', Geometry.from_rig(rig), angles='azimuth').solve(far, VARIANCES[:4])
-    assert message.theta != make_solver('minimum_tilt', Geometry.from_rig(rig)).solve(far, VARIANCES[:4]).theta
+    spots = (1e-3, 2e-3, -1e-3, -3e-3)
+    message = solver_from_rig('minimum_tilt', rig).solve(spots, VARIANCES[:4])
+    assert message == make_solver('minimum_tilt', Geometry.from_rig(rig), angles='azimuth').solve(spots, VARIANCES[:4])
+    assert message.theta != make_solver('minimum_tilt', Geometry.from_rig(rig)).solve(spots, VARIANCES[:4]).theta
     two = {'psd_1.height': 0.02, 'psd_2.height': -0.03}
     for effect, in_dots in (({}, True), ({'effects.t.name': 'plane_tilt', 'effects.t.slope_ratio': 1.5}, False)):
         rig = rig_from_values({**two, **effect})
@@ -338,9 +338,9 @@ def test_quarter_rotation_leaves_stationary_start() -> None:
     """Each dot is a quarter turn from its beam, without rounding: at angle 0 the agreement is exactly 0."""
     centers = np.array([[0.125, 0.0], [-0.125, 0.0]])
     geometry = Geometry(centers, np.zeros((2, 2)), np.zeros(2), 0.585)
-    one = make_solver('iterative', geometry).solve((-0.125, -0.125, 0.125, 0.125), VARIANCES[:4])
-    assert one.status is SolverStatus.OK
-    assert one[:3] == pytest.approx((0.0, 0.0, np.pi / 2.0), abs=1e-14)
+    solution = make_solver('iterative', geometry).solve((-0.125, -0.125, 0.125, 0.125), VARIANCES[:4])
+    assert solution.status is SolverStatus.OK
+    assert solution[:3] == pytest.approx((0.0, 0.0, np.pi / 2.0), abs=1e-14)
 
 
 def test_the_thesis_weights_are_of_two_psds() -> None:

@@ -65,15 +65,15 @@ def test_covariance_and_coverage(
         np.testing.assert_allclose(center, POSE, rtol=0.0, atol=1e-9)
     draws = FEWER if method in {'pose', 'base_pair', 'beam'} or where == 'staggered' else DRAWS
     rng = np.random.default_rng(11)
-    found = solver.solve_many(clean + np.sqrt(variances) * rng.standard_normal((draws, len(clean))), variances)
-    assert not found.status.any()
-    off = found.pose - center
+    solved = solver.solve_many(clean + np.sqrt(variances) * rng.standard_normal((draws, len(clean))), variances)
+    assert not solved.status.any()
+    off = solved.pose - center
     observed = off.T @ off / draws
-    claimed = found.covariance.mean(axis=0)
+    claimed = solved.covariance.mean(axis=0)
     scale = np.sqrt(np.diag(claimed))
     np.testing.assert_allclose(np.diag(observed) / np.diag(claimed), 1.0, atol=0.05)
     np.testing.assert_allclose(observed / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.05)
-    inside = np.abs(off) <= 1.959964 * np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    inside = np.abs(off) <= 1.959964 * np.sqrt(np.diagonal(solved.covariance, axis1=1, axis2=2))
     coverage = inside.mean(axis=0)
     assert (coverage >= 0.94).all(), coverage
     assert (coverage <= 0.96).all(), coverage
@@ -82,8 +82,8 @@ def test_covariance_and_coverage(
 def test_the_default_is_as_good_as_the_readings_allow(golden: Any, rays: Any) -> None:
     """Cramer-Rao for 2 um on each channel: 1.657 um, 1.830 um, 1.328 mdeg (docs/methods.md)."""
     geometry = golden.geometry()
-    one = make_solver('exact', geometry).solve((0.0,) * 4, (4e-12,) * 4)
-    sd = np.sqrt(np.diag(np.reshape(one.covariance, (3, 3))))
+    solution = make_solver('exact', geometry).solve((0.0,) * 4, (4e-12,) * 4)
+    sd = np.sqrt(np.diag(np.reshape(solution.covariance, (3, 3))))
     np.testing.assert_allclose(sd[2], np.sqrt(2.0) * 2e-6 / np.hypot(0.1, 0.07), rtol=1e-12)
     np.testing.assert_allclose([1e6 * sd[0], 1e6 * sd[1], 1e3 * np.degrees(sd[2])], [1.63, 1.83, 1.328], atol=0.005)
 
@@ -103,10 +103,10 @@ def code_runs() -> tuple[Any, Any]:
 
 @pytest.mark.slow
 def test_the_code_stops_early_on_clockwise_twist(code_runs: Any) -> None:
-    poses, found = code_runs
+    poses, solved = code_runs
     clockwise = poses[:, 2] < 0.0
-    assert not found.status[clockwise].any()
-    off = (found.pose - poses[:, :3])[clockwise] * UNITS
+    assert not solved.status[clockwise].any()
+    off = (solved.pose - poses[:, :3])[clockwise] * UNITS
     assert np.abs(off[:, 2]).max() < 200.0
     np.testing.assert_allclose(off[:, 2].mean(), 75.7, atol=0.5)
     np.testing.assert_allclose(off[:, 0].mean(), 92.5, atol=0.5)
@@ -114,10 +114,10 @@ def test_the_code_stops_early_on_clockwise_twist(code_runs: Any) -> None:
 
 @pytest.mark.slow
 def test_the_code_loses_and_mistakes_counter_clockwise_twist(code_runs: Any) -> None:
-    poses, found = code_runs
+    poses, solved = code_runs
     counter = poses[:, 2] > 0.0
-    lost = found.status[counter] != 0
-    off = np.abs(found.pose - poses[:, :3])[counter, 2] * UNITS[2]
+    lost = solved.status[counter] != 0
+    off = np.abs(solved.pose - poses[:, :3])[counter, 2] * UNITS[2]
     assert lost.mean() == pytest.approx(0.0268, abs=0.005)
     assert (off[~lost] > 200.0).mean() == pytest.approx(0.0089, abs=0.004)
     small = np.abs(poses[counter, 1]) < 50e-6
@@ -131,8 +131,8 @@ def test_a_wrong_slope_ratio_costs_little(k: float) -> None:
     """rms over the grid where the beam solver takes 1.5: micrometres and millidegrees (docs/methods.md)."""
     true = Geometry(thesis_geometry().centers, np.zeros((2, 2)), np.zeros(2), 0.585, k)
     poses = grid('cantilever tilts', true)
-    found = make_solver('beam', thesis_geometry()).solve_many(dots_of(true, poses), VARIANCES)
-    rms = np.sqrt(np.mean((found.pose - poses[:, :3]) ** 2, axis=0)) * UNITS
+    solved = make_solver('beam', thesis_geometry()).solve_many(dots_of(true, poses), VARIANCES)
+    rms = np.sqrt(np.mean((solved.pose - poses[:, :3]) ** 2, axis=0)) * UNITS
     want = {1.0: (1.9, 1.5, 1.0), 1.395: (0.45, 0.36, 0.25), 2.0: (2.6, 2.1, 1.4)}[k]
     np.testing.assert_allclose(rms, want, rtol=0.05)
 

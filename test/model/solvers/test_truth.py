@@ -130,12 +130,12 @@ def test_covariance_is_rotated_reading_plus_twist(psd: int, theta_sd: float) -> 
     geometry = Geometry.from_rig(load_rig())
     dot, variances, theta = np.array([2e-3, -3e-3]), np.array([4e-12, 1e-12]), 0.7
     c, s = np.cos(theta), np.sin(theta)
-    turn, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
+    rotation, slope = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
     gain = -slope @ (geometry.centers[psd] + dot)
     wanted = np.zeros((3, 3))
-    wanted[:2, :2] = turn @ np.diag(variances) @ turn.T
+    wanted[:2, :2] = rotation @ np.diag(variances) @ rotation.T
     full = np.append(gain, 1.0)
     wanted += theta_sd**2 * np.outer(full, full)
-    dx, dy, found = OnePsd(geometry).solve(psd, (2e-3, -3e-3), (4e-12, 1e-12), theta, theta_sd**2)
-    np.testing.assert_allclose(np.reshape(found, (3, 3)), wanted, rtol=1e-9, atol=1e-24)
-    np.testing.assert_allclose((dx, dy), geometry.beams[psd] - turn @ (geometry.centers[psd] + dot), atol=1e-15)
+    dx, dy, covariance = OnePsd(geometry).solve(psd, (2e-3, -3e-3), (4e-12, 1e-12), theta, theta_sd**2)
+    np.testing.assert_allclose(np.reshape(covariance, (3, 3)), wanted, rtol=1e-9, atol=1e-24)
+    np.testing.assert_allclose((dx, dy), geometry.beams[psd] - rotation @ (geometry.centers[psd] + dot), atol=1e-15)

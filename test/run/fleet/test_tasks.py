@@ -56,12 +56,12 @@ class Later:
 
 def test_outcomes_come_in_order_whatever_ends_first() -> None:
     ended: list[int] = []
-    found = list(tasks.outcomes(length, NAMES, Later(3), lambda: ended.append(1)))
-    assert [o.name for o in found] == NAMES
-    assert [o.value for o in found] == [1, 3, None, 2, None, 4]
+    outcomes = list(tasks.outcomes(length, NAMES, Later(3), lambda: ended.append(1)))
+    assert [o.name for o in outcomes] == NAMES
+    assert [o.value for o in outcomes] == [1, 3, None, 2, None, 4]
     assert len(ended) == len(NAMES)
-    assert found[2].error == 'rejected: no such recording'
-    assert found[4].error.startswith('defect: a defect of psd_deflection, ZeroDivisionError: division by zero; ')
+    assert outcomes[2].error == 'rejected: no such recording'
+    assert outcomes[4].error.startswith('defect: a defect of psd_deflection, ZeroDivisionError: division by zero; ')
 
 
 def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
@@ -76,17 +76,17 @@ def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
         return future
 
     engine.submit = alone  # type: ignore[method-assign]
-    found = list(tasks.outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
-    assert [o.value for o in found] == [1, 3, None, 4, 1]
-    assert found[2].error == 'cc: its worker was killed, twice; too little memory?'
+    outcomes = list(tasks.outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
+    assert [o.value for o in outcomes] == [1, 3, None, 4, 1]
+    assert outcomes[2].error == 'cc: its worker was killed, twice; too little memory?'
     assert engine.renewed == 3
 
 
 def test_a_worker_that_is_lost_once_more_costs_nothing() -> None:
     # `cc` waited for a worker when the pool was lost, and is killed once itself.
     engine = Later(1, 'cc', 'cc')
-    found = list(tasks.outcomes(length, ['a', 'cc', 'dddd'], engine))
-    assert [o.value for o in found] == [1, 2, 4]
+    outcomes = list(tasks.outcomes(length, ['a', 'cc', 'dddd'], engine))
+    assert [o.value for o in outcomes] == [1, 2, 4]
     assert engine.renewed == 2
 
 
@@ -127,9 +127,9 @@ def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -
 def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
     names = [str(tmp_path / name) for name in ('a', 'poison', 'bb', 'once', 'ccc')]
     with tasks.open_engine('processes:2') as pool:
-        found = list(tasks.outcomes(dies, names, pool))
-    assert [o.value for o in found] == [1, None, 2, 4, 3]
-    assert found[1].error.endswith('poison: its worker was killed, twice; too little memory?')
+        outcomes = list(tasks.outcomes(dies, names, pool))
+    assert [o.value for o in outcomes] == [1, None, 2, 4, 3]
+    assert outcomes[1].error.endswith('poison: its worker was killed, twice; too little memory?')
 
 
 @pytest.mark.slow

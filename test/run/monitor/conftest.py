@@ -39,5 +39,5 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     # Imported here: only these tests need selenium.
     from .browsing import Page
 
-    with contextlib.closing(Page(tmp_path_factory.mktemp('profile'))) as one:
-        yield one
+    with contextlib.closing(Page(tmp_path_factory.mktemp('profile'))) as browser:
+        yield browser

@@ -65,8 +65,8 @@ def parameter_file(folder: Path, **values: object) -> str:
 def free_port() -> int:
     """One that stays free while nobody serves on it: none of those that the system gives to whoever connects."""
     for port in random.sample(range(10_000, 32_000), 100):
-        with socket.socket() as one, contextlib.suppress(OSError):
-            one.bind(('127.0.0.1', port))
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(('127.0.0.1', port))
             return port
     pytest.fail('no port is free')
 
@@ -382,12 +382,12 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
     serving = serve()
     look_on, connections = serving.server.look_on, 0
 
-    def counted(*given: Any, **named: Any) -> Any:
+    def counting(*given: Any, **named: Any) -> Any:
         nonlocal connections
         connections += 1
         return look_on(*given, **named)
 
-    serving.server.look_on = counted  # type: ignore[method-assign]
+    serving.server.look_on = counting  # type: ignore[method-assign]
     page.open(serving.url)
     given = 0
 
@@ -419,12 +419,12 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
 
 
 def audit(page: Page, ready: str) -> None:
-    found = []
+    problems = []
     for view in views(page.driver):
         page.driver.refresh()
         page.until(ready)
-        found += [f'{view}: {line}' for line in violations(page.driver)]
-    assert found == []
+        problems += [f'{view}: {line}' for line in violations(page.driver)]
+    assert problems == []
 
 
 @pytest.fixture

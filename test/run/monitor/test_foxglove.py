@@ -138,8 +138,8 @@ def test_an_address_that_is_not_ours_is_named() -> None:
 def test_without_aiohttp_the_error_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: None if name == 'aiohttp' else found(name))
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: None if name == 'aiohttp' else find_spec(name))
     assert main(['monitor', str(BAGS / 'clean'), '--foxglove']) == 3
     assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err
 
@@ -218,25 +218,25 @@ def test_which_pages_may_look_is_a_parameter() -> None:
 
 def deaf(served: Served) -> socket.socket:
     """A viewer that asks for everything and then reads nothing, not even the answer to its pings."""
-    one = socket.create_connection(('127.0.0.1', served.port))
-    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    one.sendall(
+    viewer = socket.create_connection(('127.0.0.1', served.port))
+    viewer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    viewer.sendall(
         (
             f'GET / HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
             'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n'
             'Sec-WebSocket-Protocol: foxglove.websocket.v1\r\n\r\n'
         ).encode()
     )
-    assert b'101' in one.recv(100)
+    assert b'101' in viewer.recv(100)
     asked = [{'id': n, 'channelId': n} for n in range(1, 12)]
     text = json.dumps({'op': 'subscribe', 'subscriptions': asked}).encode()
     # Masked with zeros, as a client must mask.
-    one.sendall(bytes((0x81, 0x80 | 126)) + struct.pack('>H', len(text)) + bytes(4) + text)
-    return one
+    viewer.sendall(bytes((0x81, 0x80 | 126)) + struct.pack('>H', len(text)) + bytes(4) + text)
+    return viewer
 
 
 def test_deaf_viewers_have_bounded_backlog_and_delay_no_end(served: Served) -> None:
-    ones = [deaf(served) for _ in range(VIEWERS)]
+    viewers = [deaf(served) for _ in range(VIEWERS)]
     deadline = time.monotonic() + WAIT_S
     backlogs = [_Viewer()]
     while not all(v.subscriptions for v in backlogs) or len(backlogs) < VIEWERS:
@@ -249,19 +249,19 @@ def test_deaf_viewers_have_bounded_backlog_and_delay_no_end(served: Served) -> N
     served.server.close()
     assert time.monotonic() - began < 1.0 + BUSY_S
     assert not served.server._thread.is_alive()
-    for one in ones:
-        one.close()
+    for viewer in viewers:
+        viewer.close()
     assert not served.logged
 
 
 def test_viewers_that_vanish_cost_no_line(served: Served, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(100):
-        ones = [deaf(served) for _ in range(8)]
+        viewers = [deaf(served) for _ in range(8)]
         served.give(10, 10_000)
-        for one in ones:
+        for viewer in viewers:
             # Without leave: a reset.
-            one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
-            one.close()
+            viewer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
+            viewer.close()
 
     def all_gone() -> bool:
         # Who is gone is noticed when something is sent.
@@ -292,13 +292,13 @@ def test_viewers_that_vanish_cost_no_line(served: Served, caplog: pytest.LogCapt
 def test_what_is_not_understood_is_not_answered_and_harms_nobody(served: Served, text: str) -> None:
     async def go() -> int:
         async with aiohttp.ClientSession() as client:
-            one = await connected(client, served.server.address)
-            await one.send_str(text)
-            await one.send_json({'op': 'subscribe', 'subscriptions': [{'id': 7, 'channelId': 1}]})
+            viewer = await connected(client, served.server.address)
+            await viewer.send_str(text)
+            await viewer.send_json({'op': 'subscribe', 'subscriptions': [{'id': 7, 'channelId': 1}]})
             while True:
                 served.server.put(*first_topic(served), b'x', 5)
                 with contextlib.suppress(TimeoutError):
-                    got = await asyncio.wait_for(one.receive(), 0.1)
+                    got = await asyncio.wait_for(viewer.receive(), 0.1)
                     if got.type is aiohttp.WSMsgType.BINARY:
                         return int.from_bytes(got.data[1:5], 'little')
 

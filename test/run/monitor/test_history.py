@@ -34,8 +34,8 @@ def row(t_ns: int, dx: float | None, total: float = 5.0, lost: int = 0, gone: in
 
 def filled(rows: Iterable[BlockResult], levels: tuple[tuple[int, int], ...] = LEVELS) -> History:
     made = History(2, SIZE, levels)
-    for one in rows:
-        made.add(one)
+    for result in rows:
+        made.add(result)
     return made
 
 
@@ -61,19 +61,19 @@ class Plain:
         self.slots: list[dict[int, int]] = [{} for _ in SMALL]
         self.second = -(10**18)
 
-    def add(self, one: BlockResult) -> None:
-        second = one.spots.t_ns // SECOND
+    def add(self, result: BlockResult) -> None:
+        second = result.spots.t_ns // SECOND
         if second < self.second:
             self.rows = [r for r in self.rows if r.spots.t_ns // SECOND < second]
             for (width, length), slots in zip(SMALL, self.slots, strict=True):
-                kept = {r.spots.t_ns // SECOND // width for r in self.rows}
+                present = {r.spots.t_ns // SECOND // width for r in self.rows}
                 for slot, key in list(slots.items()):
                     if key >= second // width:
                         del slots[slot]
-                if (key := second // width) in kept:
+                if (key := second // width) in present:
                     slots[key % length] = key
         self.second = second
-        self.rows.append(one)
+        self.rows.append(result)
         for (width, length), slots in zip(SMALL, self.slots, strict=True):
             slots[second // width % length] = second // width
 
@@ -109,33 +109,33 @@ def test_cells_are_what_the_rows_say(
             keeper.add(row(t_ns, dx, total, lost, gone))
     until_ns = t_ns + SECOND - past * 37 * SECOND
     wanted = history.Asked(until_ns - span * SECOND, until_ns, points)
-    found = made.window(wanted)
+    view = made.window(wanted)
     # Which level it was taken from is the finest that reaches back and is not finer than needed.
     level = next(
         i for i, ring in enumerate(made.rings) if ring is made.ring_for(wanted.from_ns, span * SECOND // points)
     )
     plain.of = tuple(i == level for i in range(3))  # type: ignore[assignment]
-    width = found.width_ns
+    width = view.width_ns
     assert width % (SMALL[level][0] * SECOND) == 0
-    assert len(found.columns['dx']) <= points + 1
+    assert len(view.columns['dx']) <= points + 1
     first, last = wanted.from_ns // width * width, -(-wanted.to_ns // width) * width
     inside = plain.between(width, first, last)
-    assert sum(found.columns['blocks']) == len(inside)
-    for k in range(len(found.columns['dx'])):
-        start = found.start_ns + k * width
+    assert sum(view.columns['blocks']) == len(inside)
+    for k in range(len(view.columns['dx'])):
+        start = view.start_ns + k * width
         here = [r for r in inside if start <= r.spots.t_ns < start + width]
         dxs = [r.estimate.dx for r in here if r.estimate is not None]
         sums = [r.spots.sums[0] for r in here if not math.isnan(r.spots.sums[0])]
         for name, values in (('dx', dxs), ('sum1', sums)):
-            mean, low, high = (found.columns[name + end][k] for end in ('', '_low', '_high'))
+            mean, low, high = (view.columns[name + end][k] for end in ('', '_low', '_high'))
             if not values:
                 assert np.isnan([mean, low, high]).all()
                 continue
             assert mean == pytest.approx(math.fsum(values) / len(values), rel=1e-12, abs=1e-15)
             assert (low, high) == (np.float32(min(values)), np.float32(max(values)))
-        assert found.columns['blocks'][k] == len(here)
-        assert found.columns['estimates'][k] == len(dxs)
-        assert found.columns['lost'][k] == sum(r.spots.lost + SIZE * r.gone for r in here)
+        assert view.columns['blocks'][k] == len(here)
+        assert view.columns['estimates'][k] == len(dxs)
+        assert view.columns['lost'][k] == sum(r.spots.lost + SIZE * r.gone for r in here)
 
 
 def test_old_times_are_asked_of_the_level_that_still_has_them() -> None:
@@ -155,9 +155,9 @@ def test_a_clock_that_is_set_back_leaves_what_lies_before() -> None:
     # The file has the marks that are forgotten.
     assert made.unsaved().marks == [(START_NS + 10 * SECOND, '[10]')]
     for level in (200, 20, 4):
-        found = window(made, 0, 200, level)
-        assert found.columns['blocks'].sum() == 126
-        assert np.nanmax(found.columns['dx_high']) == np.float32(2e-3)
+        view = window(made, 0, 200, level)
+        assert view.columns['blocks'].sum() == 126
+        assert np.nanmax(view.columns['dx_high']) == np.float32(2e-3)
     assert json.loads(made.answer(history.Asked(START_NS, START_NS + 200 * SECOND, 100)))['marks'] == [[10]]
 
 
@@ -171,18 +171,18 @@ def test_a_clock_that_is_far_off_for_a_moment_does_no_harm() -> None:
 def test_constant_time_and_huge_losses_take_no_room() -> None:
     made = filled(row(START_NS, 1e-3, gone=2**60) for _ in range(5000))
     assert sum(map(len, made._values)) <= 5 * history.MOST_BLOCKS
-    found = window(made, 0, 1)
-    assert found.columns['blocks'].tolist() == [5000]
-    assert 0 < found.columns['lost'][0] <= 5 * history.MOST_LOST
+    view = window(made, 0, 1)
+    assert view.columns['blocks'].tolist() == [5000]
+    assert 0 < view.columns['lost'][0] <= 5 * history.MOST_LOST
 
 
 def test_a_gap_has_no_value_and_loses_nothing() -> None:
     made = filled(row(START_NS + s * SECOND, 1e-3, lost=1) for s in (*range(10), *range(70, 80)))
-    found = window(made, 0, 80).columns
+    view = window(made, 0, 80).columns
     there = np.repeat([1.0, 0.0, 1.0], [10, 60, 10])
-    np.testing.assert_array_equal(np.isfinite(found['dx']), there > 0.0)
+    np.testing.assert_array_equal(np.isfinite(view['dx']), there > 0.0)
     for name in ('blocks', 'estimates', 'lost'):
-        np.testing.assert_array_equal(found[name], there)
+        np.testing.assert_array_equal(view[name], there)
     # In cells wider than the gap it is not seen, but their count of blocks tells it.
     assert window(made, 0, 80, 1).columns['blocks'].tolist() == [10, 10]
 
@@ -205,10 +205,10 @@ def test_memory_is_taken_once_and_marks_are_bounded() -> None:
 def test_a_week_is_answered_in_the_cells_that_were_asked_for() -> None:
     made = filled(row(START_NS + s * SECOND, 1e-6 * s) for s in range(0, 8 * 86_400, 30))
     for span, points, width in ((7 * 86_400, 2000, 360), (86_400, 1000, 120), (3600, 700, 6), (600, 700, 1)):
-        found = window(made, 8 * 86_400 - span, 8 * 86_400, points)
-        assert found.width_ns == width * SECOND
-        assert len(found.columns['dx']) <= points + 1
-        assert found.columns['blocks'].sum() == pytest.approx(span / 30, abs=width / 30 + 1)
+        view = window(made, 8 * 86_400 - span, 8 * 86_400, points)
+        assert view.width_ns == width * SECOND
+        assert len(view.columns['dx']) <= points + 1
+        assert view.columns['blocks'].sum() == pytest.approx(span / 30, abs=width / 30 + 1)
 
 
 def test_an_answer_has_times_in_seconds_and_floats_in_base64() -> None:
@@ -252,8 +252,8 @@ def test_the_window_of_a_request() -> None:
 
 def test_all_time_may_be_asked_for() -> None:
     made = filled(row(START_NS + s * SECOND, 1e-3) for s in range(200))
-    found = made.window(asked({'from': '-9e9', 'to': '9e9', 'points': '2000'}))
-    assert (found.columns['blocks'].tolist(), found.width_ns) == ([200], 9_000_000 * SECOND)
+    view = made.window(asked({'from': '-9e9', 'to': '9e9', 'points': '2000'}))
+    assert (view.columns['blocks'].tolist(), view.width_ns) == ([200], 9_000_000 * SECOND)
 
 
 def test_outdated_cell_does_not_replace_newer_cell() -> None:

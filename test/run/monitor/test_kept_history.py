@@ -66,9 +66,9 @@ def test_what_is_kept_at_any_time_is_what_there_was(
         if data.draw(st.booleans()):
             file.save(made.unsaved())
     file.save(made.unsaved())
-    kept = file.load(LATER, LATER)
+    stored = file.load(LATER, LATER)
     full = made.rings[1].between(0, made.rings[1].newest + 1)
-    assert kept.cells[-len(full) :].tobytes() == full.tobytes()
+    assert stored.cells[-len(full) :].tobytes() == full.tobytes()
     file.close()
 
 
@@ -82,8 +82,8 @@ def test_two_runs_are_as_one(file_of: Open) -> None:
     # The first blocks came before the disk had answered, and in the cell in which the first run ended.
     second.mark(START_NS + 230 * SECOND, '[2]')
     second.load(file.load(LATER, LATER))
-    for one in rows[460:]:
-        second.add(one)
+    for result in rows[460:]:
+        second.add(result)
     full = filled(rows)
     for points in (2000, 300):
         got, want = cells(second, 0, points), cells(full, 0, points)
@@ -114,11 +114,11 @@ def test_what_lies_after_now_is_passed_over_and_goes(file_of: Open) -> None:
     file = file_of(made)
     file.save(made.unsaved())
     now = START_NS + 50 * SECOND
-    kept = file.load(now // (10 * SECOND), now)
-    assert [int(key) for key in kept.cells['key']] == [START_NS // (10 * SECOND)]
-    assert kept.marks == []
+    stored = file.load(now // (10 * SECOND), now)
+    assert [int(key) for key in stored.cells['key']] == [START_NS // (10 * SECOND)]
+    assert stored.marks == []
     back = History(2, SIZE)
-    back.load(kept)
+    back.load(stored)
     file.save(back.unsaved())
     assert len(file.load(LATER, LATER).cells) == 1
 
@@ -138,13 +138,13 @@ def test_cells_and_marks_that_are_none_are_passed_over(file_of: Open, tmp_path: 
     file = file_of(made, tmp_path / 'a')
     file.save(made.unsaved())
     key = START_NS // (10 * SECOND)
-    with contextlib.closing(sqlite3.connect(tmp_path / 'a')) as own, own:
-        own.execute('UPDATE cells SET cell = ? WHERE key = ?', (b'short', key))
-        own.execute('UPDATE cells SET key = -5 WHERE key = ?', (key + 1,))
-        own.execute("INSERT INTO marks VALUES (0, 'no JSON'), (1, '{}'), ('noon', '[1]')")
-    kept = file.load(LATER, LATER)
-    assert [int(k) for k in kept.cells['key']] == [key + 2, key + 3]
-    assert (kept.from_key, kept.marks) == (0, [(START_NS, '[1]')])
+    with contextlib.closing(sqlite3.connect(tmp_path / 'a')) as database, database:
+        database.execute('UPDATE cells SET cell = ? WHERE key = ?', (b'short', key))
+        database.execute('UPDATE cells SET key = -5 WHERE key = ?', (key + 1,))
+        database.execute("INSERT INTO marks VALUES (0, 'no JSON'), (1, '{}'), ('noon', '[1]')")
+    stored = file.load(LATER, LATER)
+    assert [int(k) for k in stored.cells['key']] == [key + 2, key + 3]
+    assert (stored.from_key, stored.marks) == (0, [(START_NS, '[1]')])
 
 
 class Keeping:
@@ -173,48 +173,48 @@ Keep = Callable[[], Keeping]
 @pytest.fixture
 def keep(tmp_path: Path, request: pytest.FixtureRequest) -> Keep:
     def begin() -> Keeping:
-        one = Keeping(tmp_path / 'state' / 'history.sqlite')
-        request.addfinalizer(one.keeper.end)
-        return one
+        keeping = Keeping(tmp_path / 'state' / 'history.sqlite')
+        request.addfinalizer(keeping.keeper.end)
+        return keeping
 
     return begin
 
 
 def test_nothing_is_saved_before_what_was_kept_is_read(keep: Keep) -> None:
-    one = keep()
-    one.history.add(row(START_NS, 0.0))
-    one.keeper.save()
-    one.restored()
-    one.saved()
-    one.keeper.end()
-    assert not one.keeper.alive
+    first = keep()
+    first.history.add(row(START_NS, 0.0))
+    first.keeper.save()
+    first.restored()
+    first.saved()
+    first.keeper.end()
+    assert not first.keeper.alive
     two = keep()
     two.restored()
     assert two.count() == 1
-    assert one.logged == two.logged == []
+    assert first.logged == two.logged == []
 
 
 def test_a_damaged_file_is_put_aside(keep: Keep, tmp_path: Path) -> None:
     (tmp_path / 'state').mkdir()
     (tmp_path / 'state' / 'history.sqlite').write_bytes(b'no database at all' * 100)
-    one = keep()
-    one.restored()
+    first = keep()
+    first.restored()
     why = 'the kept history cannot be read (file is not a database); it is history.sqlite.damaged now'
-    assert one.logged == [f'{tmp_path}/state/history.sqlite: {why}']
+    assert first.logged == [f'{tmp_path}/state/history.sqlite: {why}']
     assert (tmp_path / 'state' / 'history.sqlite.damaged').read_bytes()[:18] == b'no database at all'
-    one.history.add(row(START_NS, 0.0))
-    one.keeper.end()
+    first.history.add(row(START_NS, 0.0))
+    first.keeper.end()
     two = keep()
     two.restored()
     assert two.count() == 1
 
 
 def test_a_file_that_is_damaged_inside_is_put_aside(keep: Keep, tmp_path: Path) -> None:
-    one = keep()
-    one.restored()
+    first = keep()
+    first.restored()
     for k in range(500):
-        one.history.add(row(START_NS + k * 10 * SECOND, 0.0))
-    one.keeper.end()
+        first.history.add(row(START_NS + k * 10 * SECOND, 0.0))
+    first.keeper.end()
     path = tmp_path / 'state' / 'history.sqlite'
     content = bytearray(path.read_bytes())
     content[3 * 4096 : -4096] = bytes(len(content) - 4 * 4096)
@@ -228,28 +228,28 @@ def test_a_file_that_is_damaged_inside_is_put_aside(keep: Keep, tmp_path: Path) 
 
 def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Keep, tmp_path: Path) -> None:
     (tmp_path / 'state').write_text('a file')
-    one = keep()
-    until(lambda: bool(one.logged))
-    one.history.add(row(START_NS, 0.0))
-    one.keeper.save()
-    one.keeper.end()
-    (logged,) = one.logged
+    keeping = keep()
+    until(lambda: bool(keeping.logged))
+    keeping.history.add(row(START_NS, 0.0))
+    keeping.keeper.save()
+    keeping.keeper.end()
+    (logged,) = keeping.logged
     assert logged.startswith(f'{tmp_path}/state/history.sqlite: the history of the page cannot be kept (')
 
 
 def test_what_the_disk_rejected_is_written_the_next_time(keep: Keep, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = keep()
-    one.restored()
+    first = keep()
+    first.restored()
     with monkeypatch.context() as patched:
         full = Mock(side_effect=sqlite3.OperationalError('database or disk is full'))
         patched.setattr(HistoryFile, 'save', full)
         for k in range(3):
-            one.history.add(row(START_NS + k * 10 * SECOND, 0.0))
-            one.saved()
-    assert len(one.logged) == 1
-    assert 'disk is full' in one.logged[0]
-    one.history.add(row(START_NS + 50 * SECOND, 0.0))
-    one.keeper.end()
+            first.history.add(row(START_NS + k * 10 * SECOND, 0.0))
+            first.saved()
+    assert len(first.logged) == 1
+    assert 'disk is full' in first.logged[0]
+    first.history.add(row(START_NS + 50 * SECOND, 0.0))
+    first.keeper.end()
     two = keep()
     two.restored()
     assert two.count() == 4
@@ -264,17 +264,17 @@ def test_a_disk_that_hangs_holds_nobody(keep: Keep, monkeypatch: pytest.MonkeyPa
             return super().wait(0.05)
 
     monkeypatch.setattr(kept_history, 'threading', Mock(wraps=threading, Event=Hurried))
-    one = keep()
-    one.restored()
+    keeping = keep()
+    keeping.restored()
     gate = threading.Event()
-    monkeypatch.setattr(HistoryFile, 'save', lambda self, kept: gate.wait())
-    one.history.add(row(START_NS, 0.0))
+    monkeypatch.setattr(HistoryFile, 'save', lambda self, content: gate.wait())
+    keeping.history.add(row(START_NS, 0.0))
     for _ in range(3):
-        one.keeper.save()
-    one.keeper.end()
+        keeping.keeper.save()
+    keeping.keeper.end()
     # Not for the minutes that the disk may hang.
     assert 0.0 < sum(waited) <= 1.0
-    assert one.keeper.alive
+    assert keeping.keeper.alive
     gate.set()
 
 

@@ -63,8 +63,8 @@ def listen(url: str, until: Callable[[dict[str, Any]], bool], headers: dict[str,
     async def go() -> list[Any]:
         got: list[Any] = []
         connect = aiohttp.ClientSession.ws_connect
-        async with aiohttp.ClientSession() as one, connect(one, url + 'ws', headers=headers, max_msg_size=0) as socket:
-            async for message in socket:
+        async with aiohttp.ClientSession() as http, connect(http, url + 'ws', headers=headers, max_msg_size=0) as ws:
+            async for message in ws:
                 got.append(json.loads(message.data))
                 if until(got[-1]):
                     break
@@ -118,7 +118,7 @@ def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> Non
     names = [part.split('"')[0] for part in page.replace('src="', 'href="').split('href="')[1:]]
     # All modules are asked for at once, not each after the one that imports it.
     imported = [re.findall(r"from '(/page/\S+)'", path.read_text()) for path in server.PAGE.glob('*.js')]
-    assert {name for found in imported for name in found} <= set(names)
+    assert {name for names_of in imported for name in names_of} <= set(names)
     names += ['/page/vendor/uPlot.LICENSE']
     for name in names:
         assert name.startswith('/page/')
@@ -320,8 +320,8 @@ def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> No
 def test_who_may_not_see_the_page_does_not_get_its_history(
     serve: Serve, query: str, headers: dict[str, str], status: int, words: str
 ) -> None:
-    found, text, _ = ask(f'{serve().url}api/history?{query}', 'GET', headers=headers)
-    assert (found, words in text) == (status, True)
+    answered, text, _ = ask(f'{serve().url}api/history?{query}', 'GET', headers=headers)
+    assert (answered, words in text) == (status, True)
 
 
 @pytest.mark.parametrize('headers', [{'Origin': 'http://evil.example'}, {'Host': 'evil.example'}])
@@ -387,12 +387,12 @@ def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
     async def go() -> tuple[int | None, str]:
         async with aiohttp.ClientSession() as session:
             lookers = [await session.ws_connect(serving.url + 'ws') for _ in range(VIEWERS)]
-            for one in lookers:
-                await one.receive()
+            for looker in lookers:
+                await looker.receive()
             late = await session.ws_connect(serving.url + 'ws')
             reported = await late.receive()
-            for one in lookers:
-                await one.close()
+            for looker in lookers:
+                await looker.close()
             return reported.data, reported.extra or ''
 
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 viewers look on already')
@@ -435,7 +435,7 @@ OWN = socket.gethostname().lower()
 
 
 @pytest.mark.parametrize(
-    ('host', 'address', 'own'),
+    ('host', 'address', 'local'),
     [
         ('127.0.0.1:8790', '127.0.0.1', True),
         ('localhost:8790', '127.0.0.1', True),
@@ -463,12 +463,12 @@ OWN = socket.gethostname().lower()
         ('127.0.0.1:8790:1', '127.0.0.1', False),
     ],
 )
-def test_a_host_header_must_name_this_machine(host: str, address: str, own: bool) -> None:
-    assert is_own_host(host, address) is own
+def test_a_host_header_must_name_this_machine(host: str, address: str, local: bool) -> None:
+    assert is_own_host(host, address) is local
 
 
 @pytest.mark.parametrize(
-    ('headers', 'own'),
+    ('headers', 'local'),
     [
         ({'Host': '127.0.0.1:8790'}, True),
         ({'Host': '127.0.0.1:8790', 'Origin': 'http://127.0.0.1:8790'}, True),
@@ -482,8 +482,8 @@ def test_a_host_header_must_name_this_machine(host: str, address: str, own: bool
         ({'Host': '127.0.0.1:8790', 'Sec-Fetch-Site': 'same-site'}, False),
     ],
 )
-def test_a_request_must_come_from_our_own_page_or_from_none(headers: dict[str, str], own: bool) -> None:
-    assert is_own_page(headers) is own
+def test_a_request_must_come_from_our_own_page_or_from_none(headers: dict[str, str], local: bool) -> None:
+    assert is_own_page(headers) is local
 
 
 def test_only_loopback_is_loopback() -> None:
@@ -568,9 +568,9 @@ def test_names_types_and_units_are_those_of_openmetrics() -> None:
 def test_words_of_a_device_cannot_break_the_text() -> None:
     words = 'a "quoted" \\ word\nof two lines'
     text = text_of([counters('samples_lost', 'cause', 'Lost', {words: 3, '\udce9': 1})])
-    found = numbers(text)
-    assert found[('psd_deflection_samples_lost_total', words)] == 3.0
-    assert found[('psd_deflection_samples_lost_total', '?')] == 1.0
+    values = numbers(text)
+    assert values[('psd_deflection_samples_lost_total', words)] == 3.0
+    assert values[('psd_deflection_samples_lost_total', '?')] == 1.0
 
 
 def test_a_number_that_is_none_is_reported_as_one() -> None:
@@ -593,8 +593,8 @@ def calibrations(url: str, until: Callable[[dict[str, Any]], bool]) -> dict[str,
     """What the page is told of the calibration, as soon as ``until`` accepts it."""
 
     def accepted(message: dict[str, Any]) -> bool:
-        found = (message.get('health') or {}).get('calibration')
-        return found is not None and until(found)
+        calibration = (message.get('health') or {}).get('calibration')
+        return calibration is not None and until(calibration)
 
     last: dict[str, Any] = listen(url, accepted)[-1]['health']['calibration']
     return last
@@ -610,14 +610,14 @@ def test_it_shows_what_is_determined_and_ends_with_its_files(serve: Serve, bag: 
     serving.shown.folder = str(bag)
     assert asked(serving.url, True) == (200, 'calibrating: zero the unloaded link, then hang known loads and note each')
     assert asked(serving.url, True) == (409, 'a calibration runs already')
-    found = calibrations(serving.url, lambda c: 'parameters' in c)
-    assert found['running']
-    assert found['kind'] == 'reference'
-    assert 0 < found['determined'] < len(found['parameters'])
-    assert 1 <= len(found['needs']) <= 4
-    assert {'name', 'words', 'value', 'filled', 'determined'} <= set(found['parameters'][0])
+    progress = calibrations(serving.url, lambda c: 'parameters' in c)
+    assert progress['running']
+    assert progress['kind'] == 'reference'
+    assert 0 < progress['determined'] < len(progress['parameters'])
+    assert 1 <= len(progress['needs']) <= 4
+    assert {'name', 'words', 'value', 'filled', 'determined'} <= set(progress['parameters'][0])
     status, words = asked(serving.url, False)
-    assert (status, words) == (200, f'the calibration ends; its files: {found["out"]}')
+    assert (status, words) == (200, f'the calibration ends; its files: {progress["out"]}')
     ended = calibrations(serving.url, lambda c: not c['running'])
     assert ended['last'] == 'calibrated'
     assert {path.name for path in Path(ended['out']).iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}

@@ -109,7 +109,7 @@ class Played(Feed):
         super().__init__()
         self.times: list[int] = []
         self.gone = 0
-        self.others: list[records.Record] = []
+        self.other_records: list[records.Record] = []
         self._new = threading.Condition()
 
     def put(self, record: records.Record) -> None:
@@ -119,7 +119,7 @@ class Played(Feed):
             if isinstance(record, records.SpotMeans):
                 self.times.append(record.t_ns)
             elif isinstance(record, records.AppliedLoad | records.ReferencePose | records.ParameterChange):
-                self.others.append(record)
+                self.other_records.append(record)
             self._new.notify_all()
 
     def until(self, condition: Callable[[], bool]) -> None:

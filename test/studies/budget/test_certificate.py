@@ -102,7 +102,7 @@ def test_an_error_of_the_rig_file_makes_the_pose_wrong_by_c(certificate: Certifi
     """The true parameter is less by the error of what the rig file says of it; the exact readings are estimated."""
     p = vector_of_rig(RIG).as_used
     rows = [row for row in certificate.inputs if row.cause == 'calibration']
-    assert [row.parameter for row in rows] == [one.name for one in ALL if 'zero' not in one.name]
+    assert [row.parameter for row in rows] == [p.name for p in ALL if 'zero' not in p.name]
     for row in rows:
         error = np.zeros(len(ALL))
         error[INDEX[row.parameter]] = 1e-2 * row.u
@@ -132,10 +132,10 @@ def test_what_the_calibration_says_of_its_parameters(certificate: Certificate) -
 
 def test_a_parameter_that_is_known_exactly_has_no_correlation() -> None:
     exact = replace_values(RIG, {'calibration.sds': [0.0, 2e-3, 5e-4]})
-    found = certify(_problem(rig=exact))
-    assert found.inputs[0].u == 0.0
-    assert found.correlations[0].tolist() == [0.0] * len(found.correlations)
-    assert np.diag(found.correlations)[1:] == pytest.approx(1.0)
+    certificate = certify(_problem(rig=exact))
+    assert certificate.inputs[0].u == 0.0
+    assert certificate.correlations[0].tolist() == [0.0] * len(certificate.correlations)
+    assert np.diag(certificate.correlations)[1:] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(('rows', 'outliers', 'freedom'), [(60, 0, 58.0), (10, 7, 1.0), (10, 8, 1.0), (10, 6, 2.0)])
@@ -208,8 +208,8 @@ def test_what_cannot_be_certified_says_why() -> None:
 
 def test_a_solver_that_is_linear_weighs_nothing() -> None:
     """The direct method has one matrix, whatever the pose and the noise of a channel."""
-    found = certify(_problem(rig=replace_values(RIG, {'solver': 'wls'})))
-    noise = [row for row in found.inputs if row.cause == 'amplifier_noise']
+    certificate = certify(_problem(rig=replace_values(RIG, {'solver': 'wls'})))
+    noise = [row for row in certificate.inputs if row.cause == 'amplifier_noise']
     for row in noise:
         assert row.coefficients == pytest.approx(np.tile(row.coefficients[0], (3, 1)))
     # Two dots that both move by -1 move the plate by 1.
@@ -217,7 +217,7 @@ def test_a_solver_that_is_linear_weighs_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ('found', 'uncertainty', 'verdict'),
+    ('errors', 'uncertainty', 'verdict'),
     [
         # On the limit is within it; the powers of two make it exact.
         ((0.5, 0.0, 0.0), (0.5, 1.0, 1.0), ('conforms', 'conforms')),
@@ -232,9 +232,9 @@ def test_a_solver_that_is_linear_weighs_nothing() -> None:
     ],
 )
 def test_the_rule_is_guarded_by_u(
-    found: tuple[float, ...], uncertainty: tuple[float, ...], verdict: tuple[str, str]
+    errors: tuple[float, ...], uncertainty: tuple[float, ...], verdict: tuple[str, str]
 ) -> None:
-    got = verdict_of(np.array(found), np.array(uncertainty), np.ones(3))
+    got = verdict_of(np.array(errors), np.array(uncertainty), np.ones(3))
     assert (got.as_found, got.as_left) == verdict
 
 
@@ -247,11 +247,11 @@ LIMITS = (1e-4, 2e-4, 3e-3)
 
 def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> None:
     rows = _certified(certificate, limits=LIMITS).result_rows()
-    head, *others = rows
+    head, *rest = rows
     assert len(head) == 1 + 6 * 3 + 2
     assert head[1:4] == ['ΔX µm', 'ΔY µm', 'θ mdeg']
     verdicts = _certified(certificate, limits=LIMITS).verdicts
-    for n, (row, message) in enumerate(zip(others, certificate.stated, strict=True)):
+    for n, (row, message) in enumerate(zip(rest, certificate.stated, strict=True)):
         assert row[0] == str(n + 1)
         assert len(row) == len(head)
         parts = (certificate.poses[n], certificate.as_found[n], message.standard)
@@ -279,16 +279,16 @@ def test_the_files_have_all_digits(certificate: Certificate) -> None:
     files = _certified(certificate, limits=LIMITS).files()
     assert list(files) == [*('certificate.html', 'certificate.json', 'inputs.csv', 'correlations.csv', 'results.csv')]
     read = {name: list(csv.DictReader(io.StringIO(text))) for name, text in files.items() if name.endswith('csv')}
-    for row, one in zip(read['inputs.csv'], certificate.inputs, strict=True):
-        assert (row['cause'], row['parameter'], row['unit']) == (one.cause, one.parameter, one.unit)
-        assert row['type'] == {True: 'A', False: 'B'}[one.observed]
-        assert (float(row['u']), float(row['nu'])) == (one.u, one.freedom)
+    for row, source in zip(read['inputs.csv'], certificate.inputs, strict=True):
+        assert (row['cause'], row['parameter'], row['unit']) == (source.cause, source.parameter, source.unit)
+        assert row['type'] == {True: 'A', False: 'B'}[source.observed]
+        assert (float(row['u']), float(row['nu'])) == (source.u, source.freedom)
         for n in range(3):
-            assert [float(row[f'c_{a}_{n + 1}']) for a in AXES] == one.coefficients[n].tolist()
-    names = [one.parameter for one in certificate.inputs if one.cause == 'calibration']
+            assert [float(row[f'c_{a}_{n + 1}']) for a in AXES] == source.coefficients[n].tolist()
+    names = [source.parameter for source in certificate.inputs if source.cause == 'calibration']
     assert [row[''] for row in read['correlations.csv']] == names
-    for row, own in zip(read['correlations.csv'], certificate.correlations.tolist(), strict=True):
-        assert [float(row[name]) for name in names] == own
+    for row, correlations in zip(read['correlations.csv'], certificate.correlations.tolist(), strict=True):
+        assert [float(row[name]) for name in names] == correlations
     assert [row['pose'] for row in read['results.csv']] == ['1', '2', '3']
     for n, row in enumerate(read['results.csv']):
         message = certificate.stated[n]
@@ -313,21 +313,21 @@ def test_the_tree_and_the_table_have_the_same_numbers(certificate: Certificate) 
     assert tree['provenance'] == {'version': __version__, 'calibration': _tree()['provenance']}
     assert tree['fields']['number'] == 'A-17'
     assert np.array(tree['correlations']) == pytest.approx(certificate.correlations, abs=0.0)
-    assert [one['coefficients'] for one in tree['inputs']] == [r.coefficients.tolist() for r in certificate.inputs]
+    assert [row['coefficients'] for row in tree['inputs']] == [r.coefficients.tolist() for r in certificate.inputs]
     table = answer.table()
     assert table.index.values.tolist() == [1, 2, 3]
     columns = {column.name: column for column in table.columns}
     assert [columns[f'expanded_{axis}'].unit for axis in AXES] == ['m', 'm', 'rad']
-    for n, one in enumerate(tree['poses']):
-        assert one['pose'] == list(POSES[n]) == [columns[axis].values[n] for axis in AXES]
-        assert one['as_found'] == [columns[f'as_found_{axis}'].values[n] for axis in AXES]
-        assert one['standard'] == [columns[f'standard_{axis}'].values[n] for axis in AXES]
-        assert one['uncertainty'] == [columns[f'expanded_{axis}'].values[n] for axis in AXES]
-        assert one['uncertainty'] == certificate.stated[n].uncertainty.tolist()
-        assert one['conformity'] == answer.verdicts[n].tree()
+    for n, pose in enumerate(tree['poses']):
+        assert pose['pose'] == list(POSES[n]) == [columns[axis].values[n] for axis in AXES]
+        assert pose['as_found'] == [columns[f'as_found_{axis}'].values[n] for axis in AXES]
+        assert pose['standard'] == [columns[f'standard_{axis}'].values[n] for axis in AXES]
+        assert pose['uncertainty'] == [columns[f'expanded_{axis}'].values[n] for axis in AXES]
+        assert pose['uncertainty'] == certificate.stated[n].uncertainty.tolist()
+        assert pose['conformity'] == answer.verdicts[n].tree()
     plain = _certified(certificate).tree()
     assert plain['limits'] is None
-    assert [one['conformity'] for one in plain['poses']] == [None] * 3
+    assert [row['conformity'] for row in plain['poses']] == [None] * 3
 
 
 def test_the_page_has_every_section(certificate: Certificate) -> None:
@@ -361,9 +361,9 @@ def _folder(path: Path, tree: object) -> Path:
 def test_a_folder_is_read_whole(tmp_path: Path) -> None:
     tree = _tree()
     del tree['provenance']['date']
-    rig, found = read_calibration(_folder(tmp_path, tree))
+    rig, content = read_calibration(_folder(tmp_path, tree))
     assert rig.heights.tolist() == [0.02, 0.0]
-    assert found == {**_tree(), 'provenance': {**_tree()['provenance'], 'date': ''}}
+    assert content == {**_tree(), 'provenance': {**_tree()['provenance'], 'date': ''}}
     assert read_calibration(_folder(tmp_path, _tree()))[1] == _tree()
 
 

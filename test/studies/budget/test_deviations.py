@@ -63,9 +63,9 @@ def _at(method: str = 'exact', rig: Rig = RIG, load: tuple[float, float, float] 
 
 
 def _term(name: str) -> Term:
-    found = next(c for c in CAUSES if c.name == name)
-    assert isinstance(found, Term)
-    return found
+    cause = next(c for c in CAUSES if c.name == name)
+    assert isinstance(cause, Term)
+    return cause
 
 
 def _index(kelvin: float, metres: float) -> float:
@@ -96,8 +96,8 @@ def _deviations() -> dict[str, list[float]]:
     inside = math.asin(_index(301.0, 700e-9) * math.sin(0.3) / _index(314.0, 700e-9))
     boundary = abs(math.tan(inside) - math.tan(0.3)) * 0.7
     # A mean over 20 samples of exp(i w t), as a sum.
-    turns = np.exp(2j * math.pi * 57.0 * np.arange(samples) / 1000.0)
-    left = abs(turns.mean())
+    phasors = np.exp(2j * math.pi * 57.0 * np.arange(samples) / 1000.0)
+    gain = abs(phasors.mean())
     return {
         'light_profile': [1e-3 * _diameter(0.7)] * 4,
         'spot_clipping': [1.0],
@@ -110,7 +110,7 @@ def _deviations() -> dict[str, list[float]]:
         'quantisation': rounding.tolist(),
         'zeroing': (np.sqrt(noise**2 + rounding**2) / 3.0).tolist(),
         'refraction': [gradient] * 2 + [boundary] * 4,
-        'interference': (3e-3 * sensitivities / math.sqrt(2.0) * left).tolist(),
+        'interference': (3e-3 * sensitivities / math.sqrt(2.0) * gain).tolist(),
         'pointing_drift': [10e-6 * 0.7] * 4,
         'sensor_rotation': [8.7e-3 / math.sqrt(3.0)] * 2,
         'beam_misalignment': [3.5e-3 / math.sqrt(3.0)] * 4,
@@ -168,12 +168,12 @@ def _traced(chain: MeasuringChain, pose: FloatArray, dz: float, psd: int) -> Flo
     k = chain.slope_ratio[0] / chain.link_length
     plate = Rotation.from_euler('zxy', [pose[2], -k * pose[1], k * pose[0]]).as_matrix()
     angles = [chain.rotation[0, psd], *chain.tilt[0, psd]]
-    own = Rotation.from_euler('zxy', angles).as_matrix()
+    sensor = Rotation.from_euler('zxy', angles).as_matrix()
     centre = np.append(chain.centers[psd] + chain.center_error[0, psd], chain.heights[psd] + chain.height_error[0, psd])
-    through = centre + own @ np.append(chain.zeros[psd], 0.0) + np.append(chain.beam_shift[0, psd], 0.0)
+    through = centre + sensor @ np.append(chain.zeros[psd], 0.0) + np.append(chain.beam_shift[0, psd], 0.0)
     along = np.append(chain.beam_slope[0, psd], 1.0)
     origin = np.append(pose[:2], dz) + plate @ (centre + np.append(chain.center_shift[0, psd], 0.0))
-    axes = plate @ own
+    axes = plate @ sensor
     # through + t along = origin + axes (x, y, 0).
     _, x, y = np.linalg.solve(np.column_stack([along, -axes[:, 0], -axes[:, 1]]), origin - through)
     return np.array([x, y])
@@ -182,23 +182,23 @@ def _traced(chain: MeasuringChain, pose: FloatArray, dz: float, psd: int) -> Flo
 def _wrong_chain() -> MeasuringChain:
     rng = np.random.default_rng(4)
 
-    def some(size: float, *shape: int) -> FloatArray:
+    def errors(size: float, *shape: int) -> FloatArray:
         return rng.normal(0.0, size, (1, 2, *shape))
 
     return replace(
         MeasuringChain.of(RIG),
-        center_error=some(1e-3, 2),
-        height_error=some(5e-3),
-        rotation=some(0.05),
-        tilt=some(0.05, 2),
-        beam_slope=some(0.05, 2),
-        center_shift=some(1e-4, 2),
-        beam_shift=some(1e-4, 2),
-        nonlinearity=some(200.0),
-        background=np.abs(some(0.05)),
-        gain=some(0.02, 2),
-        reading_shift=some(1e-4, 2),
-        zero_shift=some(1e-4, 2),
+        center_error=errors(1e-3, 2),
+        height_error=errors(5e-3),
+        rotation=errors(0.05),
+        tilt=errors(0.05, 2),
+        beam_slope=errors(0.05, 2),
+        center_shift=errors(1e-4, 2),
+        beam_shift=errors(1e-4, 2),
+        nonlinearity=errors(200.0),
+        background=np.abs(errors(0.05)),
+        gain=errors(0.02, 2),
+        reading_shift=errors(1e-4, 2),
+        zero_shift=errors(1e-4, 2),
     )
 
 
@@ -243,10 +243,10 @@ def test_weighted_least_squares_is_that_of_scipy(method: str) -> None:
     for given in (None, weights):
         root = np.sqrt(weights) if given is not None else np.ones(4)
         got = replace(estimator, weights=given).estimate(read, np.broadcast_to(RIG.zeros, (2, 2, 2)))
-        for one, pose in zip(read.reshape(2, 4), got, strict=True):
+        for row, pose in zip(read.reshape(2, 4), got, strict=True):
 
-            def away(x: FloatArray, one: FloatArray = one, root: FloatArray = root) -> Any:
-                return 1e3 * root * (readings(p, x[:, None], 0.7)[:, 0] - one)
+            def away(x: FloatArray, row: FloatArray = row, root: FloatArray = root) -> Any:
+                return 1e3 * root * (readings(p, x[:, None], 0.7)[:, 0] - row)
 
             best = least_squares(away, np.zeros(3), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale=[1e-3, 1e-3, 1e-2])
             assert pose == pytest.approx(best.x, abs=1e-8)
@@ -313,8 +313,8 @@ def test_a_twist_at_the_edge_of_the_window_is_missed_whole() -> None:
         line = COMPUTATION.contribution(replace(at, pose=np.array([0.0, 0.0, twist])))
         assert line.bias[2] == pytest.approx(-twist, rel=1e-9)
         assert not line.covariance.any()
-    beyond = COMPUTATION.contribution(replace(at, pose=np.array([0.0, 0.0, 1.001 * window])))
-    assert beyond.bias[2] == pytest.approx(-(window - 0.5e-4), rel=1e-9)
+    outside = COMPUTATION.contribution(replace(at, pose=np.array([0.0, 0.0, 1.001 * window])))
+    assert outside.bias[2] == pytest.approx(-(window - 0.5e-4), rel=1e-9)
 
 
 def test_a_method_answers_the_chain_that_it_models() -> None:

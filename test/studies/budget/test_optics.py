@@ -99,9 +99,9 @@ def test_shifts_by_hand() -> None:
 
 @pytest.mark.parametrize(('samples', 'frequency', 'rate'), [(20, 57.0, 1000.0), (7, 130.0, 800.0), (3, 999.9, 1000.0)])
 def test_what_a_mean_leaves_of_a_sinusoid_is_that_of_its_sum(samples: int, frequency: float, rate: float) -> None:
-    turns = [2.0 * math.pi * frequency * i / rate for i in range(samples)]
-    left = math.hypot(math.fsum(map(math.cos, turns)), math.fsum(map(math.sin, turns))) / samples
-    assert averaging_gain(samples, frequency, rate) == pytest.approx(left, rel=1e-6)
+    phases = [2.0 * math.pi * frequency * i / rate for i in range(samples)]
+    gain = math.hypot(math.fsum(map(math.cos, phases)), math.fsum(map(math.sin, phases))) / samples
+    assert averaging_gain(samples, frequency, rate) == pytest.approx(gain, rel=1e-6)
     assert averaging_gain(samples, 2.0 * rate, rate) == 1.0
 
 

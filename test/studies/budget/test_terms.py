@@ -331,17 +331,17 @@ def test_the_tree_has_every_number(answer: Budgeted, plain: Budgeted) -> None:
     tree = json.loads(answer.json())
     at = answer.budget.at
     assert (tree['unit'], tree['load'], tree['pose']) == (['m', 'm', 'rad'], list(LOAD), at.pose.tolist())
-    for one, (cause, line) in zip(tree['terms'], answer.budget.lines, strict=True):
-        _same(one, line)
-        assert one['kind'] == {'per estimate': 'per_estimate', 'known bias': 'known'}.get(
+    for term, (cause, line) in zip(tree['terms'], answer.budget.lines, strict=True):
+        _same(term, line)
+        assert term['kind'] == {'per estimate': 'per_estimate', 'known bias': 'known'}.get(
             cause.kind.value, 'systematic'
         )
-        assert one['inputs'] == {name: read_inputs()[name] for name in cause.inputs}
-        assert one['share'] == pytest.approx((line.rms**2 / answer.budget.total().rms ** 2).tolist())
+        assert term['inputs'] == {name: read_inputs()[name] for name in cause.inputs}
+        assert term['share'] == pytest.approx((line.rms**2 / answer.budget.total().rms ** 2).tolist())
         freedom = cause.freedom(at)
-        assert one['freedom'] == (None if freedom == math.inf else pytest.approx(freedom))
-        assert one['type'] == type_of(cause)
-        for parameter, s in zip(one['parameters'], cause.sensitivities(at), strict=True):
+        assert term['freedom'] == (None if freedom == math.inf else pytest.approx(freedom))
+        assert term['type'] == type_of(cause)
+        for parameter, s in zip(term['parameters'], cause.sensitivities(at), strict=True):
             assert (parameter['name'], parameter['u'], parameter['unit']) == (s.name, s.deviation, cause.unit)
             assert parameter['sensitivity'] == pytest.approx(s.coefficient.tolist(), rel=1e-9, abs=1e-9)
     _same(tree['totals']['total'], answer.budget.total())
@@ -453,6 +453,6 @@ def test_u_is_half_of_the_drawn_interval() -> None:
 
 def test_an_interval_is_that_of_the_middle_95_percent() -> None:
     errors = np.stack([np.linspace(-1.0, 1.0, 100_001), np.linspace(0.0, 4.0, 100_001), np.zeros(100_001)], axis=1)
-    found = evaluation.interval_of(errors)
-    assert found.half == pytest.approx([0.95, 1.9, 0.0])
-    assert found.middle == pytest.approx([0.0, 2.0, 0.0], abs=1e-12)
+    interval = evaluation.interval_of(errors)
+    assert interval.half == pytest.approx([0.95, 1.9, 0.0])
+    assert interval.middle == pytest.approx([0.0, 2.0, 0.0], abs=1e-12)

@@ -50,14 +50,14 @@ def calibrated(rig: Rig, truth: dict[str, float], pose: FloatArray, seed: int = 
 
 
 def test_a_turned_psd_is_found_with_its_sign_and_the_noise(nominal: Rig, pose: FloatArray) -> None:
-    found = calibrated(nominal, only(psd_2__rotation=0.02), pose, reference_sd=(5e-6, 20e-6, 1e-3))
-    rotated = found.values[AT['psd_2.rotation']]
+    calibration = calibrated(nominal, only(psd_2__rotation=0.02), pose, reference_sd=(5e-6, 20e-6, 1e-3))
+    rotated = calibration.values[AT['psd_2.rotation']]
     # Half the difference of the crosstalks looks the same, and gets its share.
-    skew = found.values[AT['psd_2.crosstalk_xy']] - found.values[AT['psd_2.crosstalk_yx']]
+    skew = calibration.values[AT['psd_2.crosstalk_xy']] - calibration.values[AT['psd_2.crosstalk_yx']]
     assert rotated + skew / 2.0 == pytest.approx(0.02, abs=2e-4)
     assert rotated > 0.015
-    assert found.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
-    assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
+    assert calibration.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
+    assert calibration.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
 
 
 def test_errors_are_those_that_are_reported(nominal: Rig, pose: FloatArray) -> None:
@@ -66,8 +66,8 @@ def test_errors_are_those_that_are_reported(nominal: Rig, pose: FloatArray) -> N
     errors: list[float] = []
     for _ in range(2):
         truth = misaligned.draw(rng)
-        found = calibrated(nominal, truth, pose, seed=int(rng.integers(1 << 30)), outliers=0.02)
-        errors += [float((found.values[AT[n]] - v) / found.sd[AT[n]]) for n, v in truth.items() if n in AT]
+        calibration = calibrated(nominal, truth, pose, seed=int(rng.integers(1 << 30)), outliers=0.02)
+        errors += [float((calibration.values[AT[n]] - v) / calibration.sd[AT[n]]) for n, v in truth.items() if n in AT]
     assert 0.3 < np.mean(np.square(errors)) < 2.0
     assert np.max(np.abs(errors)) < 4.5
 
@@ -87,12 +87,12 @@ def test_undetermined_parameter_keeps_value_and_sd(nominal: Rig) -> None:
     """Forces along Y alone move no dot along x and turn nothing."""
     rng = np.random.default_rng(4)
     loads = misaligned.pushes(rng, 12, 2.0) * (0.0, 1.0, 0.0)
-    found = calibrated(nominal, misaligned.draw(rng), misaligned.poses(loads))
-    alone = {next(iter(d.parts)) for d in found.undetermined if len(d.parts) == 1}
+    calibration = calibrated(nominal, misaligned.draw(rng), misaligned.poses(loads))
+    alone = {next(iter(d.parts)) for d in calibration.undetermined if len(d.parts) == 1}
     for name in ('psd_1.center_y', 'psd_2.center_x', 'beam_1.angle_x'):
         assert name in alone
-        assert found.values[AT[name]] == found.prior.mean[AT[name]]
-        assert found.sd[AT[name]] == pytest.approx(found.prior.sd[AT[name]])
+        assert calibration.values[AT[name]] == calibration.prior.mean[AT[name]]
+        assert calibration.sd[AT[name]] == pytest.approx(calibration.prior.sd[AT[name]])
     assert 'psd_1.gain_y' not in alone
 
 
@@ -120,12 +120,12 @@ def test_the_beam_solver_takes_a_calibrated_file(nominal: Rig, pose: FloatArray)
     rng = np.random.default_rng(6)
     later = misaligned.poses(misaligned.pushes(rng, 3, 1.0))
     volts = misaligned.record(truth, later, rng).volts
-    (_, exact, small), (_, beam, own) = (
+    (_, exact, small), (_, beam, of_beam) = (
         campaign.measured(replace_values(rig, {'solver': name}), volts) for name in ('exact', 'beam')
     )
     assert np.abs(exact).max(axis=0).min() > 1e-3
     assert beam == pytest.approx(exact, abs=1e-8)
-    assert own == pytest.approx(small, rel=0.1, abs=1e-16)
+    assert of_beam == pytest.approx(small, rel=0.1, abs=1e-16)
 
 
 def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
@@ -136,9 +136,9 @@ def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
         now = truth | {f'beam_{n}.{axis}': rng.normal(0.0, 3e-4) for n in (1, 2) for axis in 'xy'}
         pose = misaligned.poses(misaligned.pushes(rng, 6, 1.2))
         runs.append(campaign.run_of(misaligned.record(now, pose, rng)))
-    found = calibrate(runs, nominal)
-    assert found.fit.noise.dots == pytest.approx(1.0, abs=0.15)
-    errors = np.array([(found.values[AT[n]] - v) / found.sd[AT[n]] for n, v in truth.items() if n in AT])
+    calibration = calibrate(runs, nominal)
+    assert calibration.fit.noise.dots == pytest.approx(1.0, abs=0.15)
+    errors = np.array([(calibration.values[AT[n]] - v) / calibration.sd[AT[n]] for n, v in truth.items() if n in AT])
     assert np.abs(errors).max() < 4.0
     assert np.mean(errors**2) < 2.0
 
@@ -146,23 +146,23 @@ def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
 @pytest.mark.slow
 def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
-    found = calibrate([replace(run, reference_t=run.reference_t + 0.0123)], nominal)
-    assert found.clock + found.values[AT['reference.clock']] == pytest.approx(-0.0123, abs=2e-4)
-    assert found.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
+    calibration = calibrate([replace(run, reference_t=run.reference_t + 0.0123)], nominal)
+    assert calibration.clock + calibration.values[AT['reference.clock']] == pytest.approx(-0.0123, abs=2e-4)
+    assert calibration.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
 
 
 def test_a_non_linearity_that_does_not_last_is_dropped(nominal: Rig) -> None:
     """Of the other sign in every second eighth: on what was left out of a fit it is worse than none."""
     pose = misaligned.poses(np.tile(misaligned.pushes(np.random.default_rng(4), 6, 0.1), (8, 1)))
-    one, other = (
+    first, other = (
         misaligned.record(only(psd_1__nonlinearity=k), pose, np.random.default_rng(1), every=10) for k in (2e2, -2e2)
     )
     odd = np.arange(len(pose))[:, None] * 8 // len(pose) % 2 == 1
-    found = calibrate([campaign.run_of(replace(one, volts=np.where(odd, other.volts, one.volts)))], nominal)
-    assert 'psd_1.nonlinearity' in found.dropped
-    assert found.values[AT['psd_1.nonlinearity']] == 0.0
+    calibration = calibrate([campaign.run_of(replace(first, volts=np.where(odd, other.volts, first.volts)))], nominal)
+    assert 'psd_1.nonlinearity' in calibration.dropped
+    assert calibration.values[AT['psd_1.nonlinearity']] == 0.0
     # It is known better all the same.
-    assert found.sd[AT['psd_1.nonlinearity']] < 0.5 * found.prior.sd[AT['psd_1.nonlinearity']]
+    assert calibration.sd[AT['psd_1.nonlinearity']] < 0.5 * calibration.prior.sd[AT['psd_1.nonlinearity']]
 
 
 def test_a_recording_is_taken_with_its_rig_and_the_load_of_each_sample(tmp_path: Path) -> None:
@@ -183,9 +183,9 @@ def test_a_recording_is_taken_with_its_rig_and_the_load_of_each_sample(tmp_path:
 
 def test_a_reference_that_is_no_reference_is_rejected(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
-    found = calibrate([replace(run, reference=np.random.default_rng(1).permutation(run.reference))], nominal)
-    assert found.rejected.startswith('on motion that was not fitted')
-    values, effects = values_of(found, 'today')
+    calibration = calibrate([replace(run, reference=np.random.default_rng(1).permutation(run.reference))], nominal)
+    assert calibration.rejected.startswith('on motion that was not fitted')
+    values, effects = values_of(calibration, 'today')
     assert not effects
     assert set(values) == {'psd_1.noise', 'psd_2.noise'}
 
@@ -193,13 +193,13 @@ def test_a_reference_that_is_no_reference_is_rejected(nominal: Rig, pose: FloatA
 @pytest.mark.slow
 def test_the_redundant_reading_alone_reports_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
-    found = calibrate([run], nominal, alone=True)
+    calibration = calibrate([run], nominal, alone=True)
     # Along the base line (0.1, 0.07), which the one reading too many sees when the plate goes along X.
-    v = {name: found.values[i] for name, i in AT.items()}
+    v = {name: calibration.values[i] for name, i in AT.items()}
     along = v['psd_1.gain_x'] - v['psd_2.gain_x']
     across = v['psd_1.crosstalk_yx'] - v['psd_2.crosstalk_yx'] - v['psd_1.rotation'] + v['psd_2.rotation']
     assert 0.1 * along + 0.07 * across == pytest.approx(0.1 * 0.02, rel=0.25)
-    assert found.gap.heldout_after < 0.2 * found.gap.heldout_before
+    assert calibration.gap.heldout_after < 0.2 * calibration.gap.heldout_before
 
 
 def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
@@ -208,21 +208,21 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     truth = only(psd_1__gain_x=0.02, psd_2__rotation=0.015)
     run = campaign.run_of(misaligned.record(truth, misaligned.poses(loads), rng))
     held = CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0], loads)
-    found = calibrate([held], nominal)
-    relative = found.values[AT['psd_1.gain_x']] - found.values[AT['psd_2.gain_x']]
+    calibration = calibrate([held], nominal)
+    relative = calibration.values[AT['psd_1.gain_x']] - calibration.values[AT['psd_2.gain_x']]
     assert relative == pytest.approx(0.02, abs=0.006)
     # Common to all gains, against the clamp: no better than the tolerance of four of them.
-    assert found.sd[AT['psd_1.gain_x']] > 0.003
+    assert calibration.sd[AT['psd_1.gain_x']] > 0.003
 
 
 def test_a_check_reports_where_the_beams_are_from_the_zero_of_the_file(nominal: Rig) -> None:
     pose = misaligned.poses(misaligned.pushes(np.random.default_rng(3), 3, 0.5))
     truth = only(beam_1__x=1.2e-3, beam_1__y=-2.1e-3, beam_2__x=2e-4)
     rig = replace_values(nominal, {'psd_1.zero': [1e-3, -2e-3], 'psd_2.zero': [3e-4, 1e-4]})
-    found = check([campaign.run_of(misaligned.record(truth, pose, np.random.default_rng(1)))], rig)
-    off = np.abs(found.zero - (2e-4, -1e-4, -1e-4, -1e-4))
-    assert found.unchanged
-    assert np.all((off < 2e-5) & (off < 4.0 * found.zero_sd))
+    checkup = check([campaign.run_of(misaligned.record(truth, pose, np.random.default_rng(1)))], rig)
+    off = np.abs(checkup.zero - (2e-4, -1e-4, -1e-4, -1e-4))
+    assert checkup.unchanged
+    assert np.all((off < 2e-5) & (off < 4.0 * checkup.zero_sd))
 
 
 @pytest.mark.slow
@@ -232,10 +232,10 @@ def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     rig, _ = campaign.calibrated_rig(nominal, campaign.run_of(misaligned.record(truth, pose, rng)))
     assert check([campaign.run_of(misaligned.record(truth, pose, rng))], rig).unchanged
     moved = truth | {'psd_1.rotation': truth['psd_1.rotation'] + 0.03}
-    found = check([campaign.run_of(misaligned.record(moved, pose, rng))], rig)
-    assert not found.unchanged
-    assert found.groups[0].group == 'psd_1.rotation'
-    value, sd = found.groups[0].shifts['psd_1.rotation']
+    checkup = check([campaign.run_of(misaligned.record(moved, pose, rng))], rig)
+    assert not checkup.unchanged
+    assert checkup.groups[0].group == 'psd_1.rotation'
+    value, sd = checkup.groups[0].shifts['psd_1.rotation']
     assert abs(value - 0.03) < 4.0 * sd
 
 
@@ -276,14 +276,14 @@ def white(levels: tuple[float, ...], n: int = 5000, sigma: float = 2e-3) -> Floa
 def test_levels_are_within_what_is_reported_of_them_in_95_of_100(nominal: Rig) -> None:
     """Coloured noise and flicker: the error of white noise would be a third of that."""
     rng = np.random.default_rng(12)
-    far: list[FloatArray] = []
+    deviates: list[FloatArray] = []
     for _ in range(40):
         light = misaligned.draw_light(rng)
         levels = dark_levels([run_of(np.array(misaligned.darkness(light, 5.0, rng)))], nominal)
-        for one, truth in zip(levels, light, strict=True):
+        for level, truth in zip(levels, light, strict=True):
             true = (truth.x + truth.offset_x, truth.y + truth.offset_y, truth.level + truth.offset_sum)
-            far.append((one.volts - true) / one.sd)
-    z = np.array(far)
+            deviates.append((level.volts - true) / level.sd)
+    z = np.array(deviates)
     assert 0.92 <= np.mean(np.abs(z) < 1.96) <= 0.98
     assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
 
@@ -305,24 +305,24 @@ STUDENT = 2.093024 / 1.959964
     ],
 )
 def test_the_error_of_a_level_is_that_of_what_varies(nominal: Rig, off: FloatArray, sd: float, rel: float) -> None:
-    (one, _) = dark_levels([run_of(np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + off[:, None])], nominal)
-    assert one.sd == pytest.approx(np.full(3, sd), rel=rel)
+    (level, _) = dark_levels([run_of(np.array((1.0, 2.0, 0.1, 0.0, 0.0, 0.1)) + off[:, None])], nominal)
+    assert level.sd == pytest.approx(np.full(3, sd), rel=rel)
 
 
 def test_what_is_reported_of_one_psd(nominal: Rig) -> None:
     lit = run_of(white((0.0, 0.0, 5.12, 0.0, 0.0, 5.06), 500, 0.0))
-    (one, two) = dark_levels([run_of(darkness())], nominal, [lit])
-    assert one.lit_sum == 5.12
-    assert one.share == pytest.approx(0.12 / 5.12, rel=4e-3)
+    (level, two) = dark_levels([run_of(darkness())], nominal, [lit])
+    assert level.lit_sum == 5.12
+    assert level.share == pytest.approx(0.12 / 5.12, rel=4e-3)
     assert two.share == pytest.approx(0.06 / 5.06, rel=8e-3)
     # 0.5 mm a volt, in metres; what is left is the error of the share times half of 10 mm.
-    assert one.place == pytest.approx([1.5e-3, -1.0e-3], abs=1e-6)
-    assert one.residual == pytest.approx(5e-3 * one.sd[2] / 5.12)
-    tree = result_of_levels([one])['psd_1']
-    assert tree['sum'] == {'value': one.volts[2], 'sd': one.sd[2], 'unit': 'V', 'file': 0.0}
+    assert level.place == pytest.approx([1.5e-3, -1.0e-3], abs=1e-6)
+    assert level.residual == pytest.approx(5e-3 * level.sd[2] / 5.12)
+    tree = result_of_levels([level])['psd_1']
+    assert tree['sum'] == {'value': level.volts[2], 'sd': level.sd[2], 'unit': 'V', 'file': 0.0}
     assert tree['recording'] == {'name': 'off.csv', 'sha256': 'ab' * 32}
-    assert words_of_level(one).startswith('psd_1 with its laser off: sum 0.119')
-    assert ' % of the light pulls to (+1.50, -1.00) mm; what ' in words_of_level(one).replace('%', ' %')
+    assert words_of_level(level).startswith('psd_1 with its laser off: sum 0.119')
+    assert ' % of the light pulls to (+1.50, -1.00) mm; what ' in words_of_level(level).replace('%', ' %')
     (alone, _) = dark_levels([run_of(darkness())], nominal)
     assert alone.lit_sum == pytest.approx(5.0 + alone.volts[2])
 
@@ -337,10 +337,10 @@ def test_lasers_may_be_off_one_after_the_other_and_for_a_part(nominal: Rig) -> N
     second[600:690, 5] = 2.0
     second[4900:, 3:] = (0.0, 0.0, 5.0)
     second[4850:4900, 5] = 2.0
-    (one, two) = dark_levels([run_of(first, 'a'), run_of(second, 'b')], nominal)
-    assert (one.recording, one.seconds) == ('a', 5.0)
+    (level, two) = dark_levels([run_of(first, 'a'), run_of(second, 'b')], nominal)
+    assert (level.recording, level.seconds) == ('a', 5.0)
     assert (two.recording, two.seconds) == ('b', 4.1)
-    assert one.volts[2] == pytest.approx(0.12, abs=1e-3)
+    assert level.volts[2] == pytest.approx(0.12, abs=1e-3)
     assert two.volts[2] == pytest.approx(0.06, abs=1e-3)
 
 
@@ -400,10 +400,10 @@ def test_without_light_x_and_y_mean_nothing_and_are_not_judged(nominal: Rig) -> 
 
 def test_light_is_not_taken_off_twice(nominal: Rig) -> None:
     runs = [run_of(darkness())]
-    found = replace_values(
+    corrected = replace_values(
         nominal, {'effects.a.name': 'ambient_light', 'effects.a.psd': 1, 'effects.a.level': 0.1, 'effects.a.x': 1e-3}
     )
-    for rejected in (lambda: dark_levels(runs, found), lambda: calibrate(runs, found)):
+    for rejected in (lambda: dark_levels(runs, corrected), lambda: calibrate(runs, corrected)):
         with pytest.raises(ConfigError, match=r'^effects: ambient_light.*would count it twice; take it out'):
             rejected()
     old = replace_values(nominal, {'calibration.names': ['psd_1.gain_x'], 'calibration.sds': [1e-3]})

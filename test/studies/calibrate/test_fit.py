@@ -41,17 +41,17 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
     true = rng.uniform(-1.0, 1.0, (3, 3)) * (1e-3, 1e-3, 5e-3)
     sd = np.array([2e-6, 20e-6, 8e-6, 1e-6]) * rng.uniform(0.5, 2.0, (3, 4))
     dots = misaligned.dots(misaligned.nominal(), true) + sd * rng.normal(size=sd.shape)
-    found = fitting.pose_of_readings(dots, sd**2, p, length)
+    poses = fitting.pose_of_readings(dots, sd**2, p, length)
 
-    def misfit(x: FloatArray, pose: FloatArray, row: int) -> float:
+    def chi_square(x: FloatArray, pose: FloatArray, row: int) -> float:
         moved = pose + x * (1e-6, 1e-6, 1e-5)
         residual = (dots[row] - misaligned.dots(misaligned.nominal(), moved[None])[0]) / sd[row]
         return float(residual @ residual)
 
-    for row, pose in enumerate(found):
-        best = minimize(misfit, np.zeros(3), (pose, row), 'Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
+    for row, pose in enumerate(poses):
+        best = minimize(chi_square, np.zeros(3), (pose, row), 'Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
         np.testing.assert_allclose(best.x, 0.0, atol=0.02)
-        assert misfit(np.zeros(3), pose, row) == pytest.approx(best.fun, abs=1e-3)
+        assert chi_square(np.zeros(3), pose, row) == pytest.approx(best.fun, abs=1e-3)
 
 
 def test_clamp_prior_is_a_fifth_of_link_compliance() -> None:
@@ -155,9 +155,9 @@ def test_the_evidence_of_a_prior_is_the_probability_of_all_readings_at_once() ->
 
 def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
     free = np.arange(SIZE) < ZERO // 2
-    found = fitting.fit(rows_of_two(np.zeros(4)), RIG, PRIOR, 'self', free=free).noise
-    assert (found.reference.tolist(), found.fewer) == ([1.0, 1.0, 1.0], 1.0)
-    assert found.dots == pytest.approx(1.0, rel=0.15)
+    noise = fitting.fit(rows_of_two(np.zeros(4)), RIG, PRIOR, 'self', free=free).noise
+    assert (noise.reference.tolist(), noise.fewer) == ([1.0, 1.0, 1.0], 1.0)
+    assert noise.dots == pytest.approx(1.0, rel=0.15)
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
@@ -176,8 +176,8 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: fitting.Kind,
         Any, SimpleNamespace(sd=np.ones((n, 3)), variances=np.full((n, 4), sd**2), run=np.zeros(n, dtype=np.int64))
     )
     linear = fitting.Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
-    found = fitting.variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), PRIOR)
-    assert found.dots == pytest.approx(reported)
+    noise = fitting.variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), PRIOR)
+    assert noise.dots == pytest.approx(reported)
 
 
 PERIOD = 1e-3
@@ -200,17 +200,17 @@ def on_curves(t: FloatArray, derivative: int = 0) -> FloatArray:
 
 
 def test_polynomial_of_fit_degree_is_found_with_slope() -> None:
-    found = observation.smoothed(on_curves(T), PERIOD, WHERE)
-    assert found.good.all()
+    smooth = observation.smoothed(on_curves(T), PERIOD, WHERE)
+    assert smooth.good.all()
     scale = np.abs(on_curves(T)).max()
-    np.testing.assert_allclose(found.dots, on_curves(WHERE * PERIOD), atol=1e-9 * scale)
-    np.testing.assert_allclose(found.speed, on_curves(WHERE * PERIOD, 1), atol=1e-6 * np.abs(on_curves(T, 1)).max())
-    assert found.squares.max() < 1e-18 * scale
+    np.testing.assert_allclose(smooth.dots, on_curves(WHERE * PERIOD), atol=1e-9 * scale)
+    np.testing.assert_allclose(smooth.speed, on_curves(WHERE * PERIOD, 1), atol=1e-6 * np.abs(on_curves(T, 1)).max())
+    assert smooth.squares.max() < 1e-18 * scale
 
 
 def test_gain_is_value_variance_over_sample_variance() -> None:
-    found = observation.smoothed(np.zeros((200, 4)), PERIOD, WHERE)
-    for place, gain in zip(WHERE, found.gain, strict=True):
+    smooth = observation.smoothed(np.zeros((200, 4)), PERIOD, WHERE)
+    for place, gain in zip(WHERE, smooth.gain, strict=True):
         middle = round(place)
         u = np.arange(-10, 11) / 10.0
         basis = np.vander(u, 7, increasing=True)
@@ -220,10 +220,10 @@ def test_gain_is_value_variance_over_sample_variance() -> None:
 
 def test_over_an_exposure_it_is_the_mean() -> None:
     exposure = 0.008
-    found = observation.smoothed(on_curves(T), PERIOD, WHERE, exposure)
+    smooth = observation.smoothed(on_curves(T), PERIOD, WHERE, exposure)
     at = (np.arange(4000) + 0.5) / 4000 - 0.5
     means = [on_curves(place * PERIOD + exposure * at).mean(axis=0) for place in WHERE]
-    np.testing.assert_allclose(found.dots, means, atol=1e-6 * np.abs(means).max())
+    np.testing.assert_allclose(smooth.dots, means, atol=1e-6 * np.abs(means).max())
 
 
 def test_a_place_needs_seventeen_samples_about_it_on_both_sides() -> None:
@@ -290,18 +290,18 @@ def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     for variances in (small, large):
         rows = observation.Rows(t, run, zeros, dots, variances, zeros, loads, t >= 0.5, np.ones((100, 3)))
-        found = observation.rest_means(rows, RIG, noise)
-        assert len(found) >= 6
-        assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
+        means = observation.rest_means(rows, RIG, noise)
+        assert len(means) >= 6
+        assert {tuple(row) for row in means.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
         if variances is small:
-            least = np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(found), 1))
-            np.testing.assert_allclose(found.variances, least)
+            least = np.tile((5e-4 * noise) ** 2 * observation.CALM_LEAST, (len(means), 1))
+            np.testing.assert_allclose(means.variances, least)
         else:
             # Twelve or thirteen rows in a quarter of a second.
-            assert 1e-10 / 13.001 < found.variances.min() <= np.median(found.variances) < 1e-10 / 11.999
+            assert 1e-10 / 13.001 < means.variances.min() <= np.median(means.variances) < 1e-10 / 11.999
     # Nothing moves, so that a mean is a mean.
     first = t[(t >= 0.5) & (t < 0.75 - 1e-9)]
-    np.testing.assert_allclose(found.dots[0], dots[[round(x / 0.02) for x in first]].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(means.dots[0], dots[[round(x / 0.02) for x in first]].mean(axis=0), rtol=1e-6)
 
 
 def test_references_count_by_their_proportions_if_all_state_them() -> None:
@@ -330,16 +330,16 @@ def test_half_of_the_deviations_report_that_of_all() -> None:
 def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None:
     names = [p.group for p in PARAMETERS[:ZERO]]
     group = max(names, key=names.count)
-    own = [i for i, name in enumerate(names) if name == group]
+    members = [i for i, name in enumerate(names) if name == group]
     at = np.arange(ZERO)
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(ZERO, ZERO))
     m, score, scale = root @ root.T, rng.normal(size=ZERO), rng.uniform(0.5, 2.0, ZERO)
-    found = moved_group(group, at, score, m, scale)
+    moved = moved_group(group, at, score, m, scale)
     # In units of the prior, whose information is 1.
-    covariance = np.linalg.inv(m[np.ix_(own, own)] + np.eye(len(own)))
-    shift, sd = scale[own] * (covariance @ score[own]), scale[own] * np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose([*found.shifts.values()], np.column_stack([shift, sd]), rtol=1e-6)
+    covariance = np.linalg.inv(m[np.ix_(members, members)] + np.eye(len(members)))
+    shift, sd = scale[members] * (covariance @ score[members]), scale[members] * np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose([*moved.shifts.values()], np.column_stack([shift, sd]), rtol=1e-6)
 
 
 def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -353,15 +353,15 @@ def test_moved_group_is_fitted_with_three_tolerances(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(checking, 'explained', explained)
     group = MovedGroup('psd_1.gain', 0.01, 1.0, 2, dict.fromkeys(names, (0.0, 0.1)))
     nothing = cast(Any, None)
-    found = fitted_group(group, nothing, nothing, PRIOR, 'reference', nothing, nothing, 3.0)
+    moved = fitted_group(group, nothing, nothing, PRIOR, 'reference', nothing, nothing, 3.0)
     wider, at = np.zeros(SIZE), [INDEX[n] for n in names]
     wider[at] = 9.0 * TOLERANCES[at] ** 2
     (prior,) = given
     np.testing.assert_allclose(prior.covariance, PRIOR.covariance + np.diag(wider), rtol=1e-12)
     assert np.array_equal(prior.mean, PRIOR.mean)
     # Against nothing moved; and what it moved by.
-    assert found.evidence == pytest.approx(4.0)
-    assert [v for v, _ in found.shifts.values()] == pytest.approx([0.5] * len(names))
+    assert moved.evidence == pytest.approx(4.0)
+    assert [v for v, _ in moved.shifts.values()] == pytest.approx([0.5] * len(names))
 
 
 @pytest.mark.parametrize(('shared', 'least', 'most'), [(0.0, 0.042, 0.055), (0.9, 0.005, 0.055)])
@@ -369,8 +369,8 @@ def test_at_most_5_percent_of_sound_rigs_are_reported(shared: float, least: floa
     """20,000 rigs in which nothing moved, of as many groups as there are, independent or with a common part."""
     groups = len({p.group for p in PARAMETERS[:ZERO]})
     rng = np.random.default_rng(8)
-    common, own = rng.standard_normal((20_000, 1, 2)), rng.standard_normal((20_000, groups, 2))
-    z = np.sqrt(shared) * common + np.sqrt(1.0 - shared) * own
+    common, independent = rng.standard_normal((20_000, 1, 2)), rng.standard_normal((20_000, groups, 2))
+    z = np.sqrt(shared) * common + np.sqrt(1.0 - shared) * independent
     each = chi2.sf(np.sum(z**2, axis=2), 2)
     assert least < np.mean([overall_p(rig) < LEVEL for rig in each.tolist()]) < most
     assert (LEVEL, overall_p([]), overall_p([0.4, 0.9])) == (0.05, 1.0, 0.8)
@@ -388,10 +388,10 @@ def test_uninformed_parameters_are_undetermined() -> None:
     information += 1e4 * np.outer(pair, pair)
     covariance = fitting.posterior(information, PRIOR, free)
     full = cast(Any, SimpleNamespace(covariance=covariance, information=information, free=free))
-    found = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, PRIOR)}
-    assert set(found) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
-    one, other = found['psd_1.gain_x', 'psd_2.gain_x'].values()
-    assert (abs(one), one + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
+    parts = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, PRIOR)}
+    assert set(parts) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
+    first, other = parts['psd_1.gain_x', 'psd_2.gain_x'].values()
+    assert (abs(first), first + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
 
 
 def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
@@ -399,8 +399,8 @@ def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
     rng = np.random.default_rng(7)
     loads = np.column_stack([rng.uniform(-50.0, 50.0, (n, 2)), rng.uniform(-20.0, 20.0, n)])
     bends, twists = 2e-5, 3e-4
-    own = np.diag(LinkStatics.from_rig(RIG).compliance)
-    pose = loads * (own + np.array([bends, bends, twists]) * [RIG.link.length**2, RIG.link.length**2, 1.0])
+    compliance = np.diag(LinkStatics.from_rig(RIG).compliance)
+    pose = loads * (compliance + np.array([bends, bends, twists]) * [RIG.link.length**2, RIG.link.length**2, 1.0])
     pose[3] += (5e-3, 5e-3, 0.1)
     weights, zeros = np.ones(n), np.zeros((n, 3))
     weights[3] = 0.0
@@ -410,8 +410,8 @@ def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
     linear, none = fitting.Linear(np.zeros((n, 4)), np.zeros((n, 4, SIZE)), np.zeros((n, 4, 3))), np.zeros((SIZE, SIZE))
     noise = fitting.Noise(np.array([1e-7, 1e-7, 1e-7]))
     full = fitting.CalibrationFit(np.zeros(SIZE), none, none, linear, weights, noise, np.zeros(SIZE, dtype=bool))
-    found = with_clamp(full, rows, RIG, PRIOR)
-    assert found.values[fitting.CLAMP_AT : fitting.CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
+    fit = with_clamp(full, rows, RIG, PRIOR)
+    assert fit.values[fitting.CLAMP_AT : fitting.CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
 
 
 def calibrated(*loads: tuple[float, float, float]) -> CalibrationProgress:
@@ -444,29 +444,29 @@ def test_a_force_along_x_leaves_open_what_only_others_determine() -> None:
 
 
 @pytest.mark.parametrize(
-    ('left', 'determined', 'filled'),
+    ('ratio', 'determined', 'filled'),
     [(1.0, True, 0.0), (0.1, True, 0.5), (0.01, True, 1.0), (1e-5, True, 1.0), (0.1, False, 0.0), (np.nan, True, 0.0)],
 )
-def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(left: float, determined: bool, filled: float) -> None:
-    parameter = ParameterProgress(name='n', words='', value='', sd_ratio=left, determined=determined)
+def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(ratio: float, determined: bool, filled: float) -> None:
+    parameter = ParameterProgress(name='n', words='', value='', sd_ratio=ratio, determined=determined)
     assert parameter.filled == pytest.approx(filled)
 
 
 def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
     parameter = ParameterProgress(name='n', words='a', value='b', sd_ratio=0.1, determined=True)
     tree = CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree()
-    row, need = {**parameter._asdict(), 'filled': parameter.filled}, {'motion': 'push', 'names': ('n',)}
+    row = {'name': 'n', 'words': 'a', 'value': 'b', 'left': 0.1, 'determined': True, 'filled': parameter.filled}
     assert tree.pop('parameters') == [row]
-    assert tree.pop('needs') == [need]
+    assert tree.pop('needs') == [{'motion': 'push', 'names': ('n',)}]
     assert tree == {'kind': 'reference', 'seconds': 2.0, 'determined': 1, 'rejected': 'too short'}
 
 
 def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
     groups = [MovedGroup('psd_1.gain', 0.01, 3.0, 2, {'psd_1.gain_x': (0.02, 0.001)})]
-    found = checking.CalibrationCheck(
+    checked = checking.CalibrationCheck(
         False, 0.01, groups, ['psd_2.gain'], np.array([0.0, 1e-6, 2e-6, 3e-6]), np.full(4, 1e-7)
     )
-    tree = checking.result(found)
+    tree = checking.result(checked)
     assert [*tree['zero']] == [f'psd_{psd}.zero_{axis}' for psd in (1, 2) for axis in 'xy']
     assert [v['value'] for v in tree['zero'].values()] == [0.0, 1e-6, 2e-6, 3e-6]
     assert (tree['verdict'], tree['moved'], tree['or']) == ('moved', 'psd_1.gain', ['psd_2.gain'])
@@ -475,13 +475,13 @@ def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
 
 def test_rejection_and_covariance_are_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
-    found = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').calibration, rejected='')
-    assert result(found, '2026-11-26')['rejected'] is None
-    assert result(replace(found, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'
+    calibration = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').calibration, rejected='')
+    assert result(calibration, '2026-11-26')['rejected'] is None
+    assert result(replace(calibration, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'
     # One parameter is known exactly: it is correlated with nothing.
-    covariance = found.covariance * (np.arange(SIZE) != 3) * (np.arange(SIZE)[:, None] != 3)
-    values, _ = values_of(replace(found, fit=replace(found.fit, covariance=covariance)), '2026-11-26')
-    written = known_of_rig(replace_values(found.rig, values)).covariance
+    covariance = calibration.covariance * (np.arange(SIZE) != 3) * (np.arange(SIZE)[:, None] != 3)
+    values, _ = values_of(replace(calibration, fit=replace(calibration.fit, covariance=covariance)), '2026-11-26')
+    written = known_of_rig(replace_values(calibration.rig, values)).covariance
     off = (written - covariance[:COUNT, :COUNT]) / np.outer(TOLERANCES, TOLERANCES)
     np.testing.assert_allclose(off, 0.0, atol=1e-8)
 

@@ -64,14 +64,14 @@ def clean(key: bytes, effects: str = '[]') -> FloatArray:
 
 
 def recorded(
-    loads: FloatArray, seed: int, turn: Turn | None = None, effects: Sequence[Any] = (), **noise: Any
+    loads: FloatArray, seed: int, wiring: Turn | None = None, effects: Sequence[Any] = (), **noise: Any
 ) -> FloatArray:
-    """What the converter gives, (n, 6) V, with the channels as ``turn`` has them."""
+    """What the converter gives, (n, 6) V, with the channels as ``wiring`` has them."""
     volts = clean(np.ascontiguousarray(loads).tobytes(), json.dumps(list(effects)))
     volts = volts + generator.electronic_noise(len(volts), seed, **noise)
-    if turn is not None:
+    if wiring is not None:
         names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
-        volts = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[name] for name in names)])
+        volts = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (wiring[name] for name in names)])
     return generator.output(volts, [])
 
 
@@ -80,13 +80,13 @@ def every_turn() -> list[Turn]:
     out: list[Turn] = []
     for swapped in (False, True):
         for kinds in itertools.product(itertools.product((False, True), (1, -1), (1, -1)), repeat=2):
-            turn: dict[str, tuple[str, int]] = {}
+            wiring: dict[str, tuple[str, int]] = {}
             for number, (crossed, sx, sy) in enumerate(kinds, start=1):
                 of = 3 - number if swapped else number
-                turn[f'x{number}'] = (f'y{of}' if crossed else f'x{of}', sx)
-                turn[f'y{number}'] = (f'x{of}' if crossed else f'y{of}', sy)
-                turn[f'sum{number}'] = (f'sum{of}', 1)
-            out.append(turn)
+                wiring[f'x{number}'] = (f'y{of}' if crossed else f'x{of}', sx)
+                wiring[f'y{number}'] = (f'x{of}' if crossed else f'y{of}', sy)
+                wiring[f'sum{number}'] = (f'sum{of}', 1)
+            out.append(wiring)
     return out
 
 
@@ -95,14 +95,14 @@ def checked(volts: FloatArray, loads: FloatArray, rig: Rig | None = None) -> Che
     return check(of_recording(rig, volts, loads))
 
 
-def lines_of(turn: Turn) -> dict[str, object]:
+def lines_of(wiring: Turn) -> dict[str, object]:
     """The lines that put the nominal rig file right, from the turn alone."""
-    swapped = turn['sum1'][0] == 'sum2'
+    swapped = wiring['sum1'][0] == 'sum2'
     out: dict[str, object] = {'psds_exchanged': True} if swapped else {}
     for psd in (1, 2):
         axes = []
         for axis in ('x', 'y'):
-            channel, sign = next((c, s) for c, (of, s) in turn.items() if of == f'{axis}{psd}')
+            channel, sign = next((c, s) for c, (of, s) in wiring.items() if of == f'{axis}{psd}')
             axes.append(('-' if sign < 0 else '') + channel[0])
         if axes != ['x', 'y']:
             out[f'psd_{psd}.axes'] = axes
@@ -111,24 +111,24 @@ def lines_of(turn: Turn) -> dict[str, object]:
 
 @pytest.mark.slow
 def test_each_of_127_wrong_wirings_is_named_from_three_pushes() -> None:
-    turns = every_turn()
-    assert len(turns) == 128
+    wirings = every_turn()
+    assert len(wirings) == 128
     misnamed = []
-    for seed, turn in enumerate(turns):
+    for seed, wiring in enumerate(wirings):
         # Ten times the noise of a block is the harder one; that of a sample, now and then.
         loads = pushes(10.0 if seed % 8 == 7 else 10.0 * BLOCK)
-        found = checked(recorded(loads, seed, turn), loads)
-        wanted = lines_of(turn)
-        if found.verdict != (WRONG if wanted else RIGHT) or found.values != wanted or len(found.wirings) != 1:
-            misnamed.append((turn, found.verdict, found.values))
+        checkup = checked(recorded(loads, seed, wiring), loads)
+        wanted = lines_of(wiring)
+        if checkup.verdict != (WRONG if wanted else RIGHT) or checkup.values != wanted or len(checkup.wirings) != 1:
+            misnamed.append((wiring, checkup.verdict, checkup.values))
     assert not misnamed
 
 
 def test_a_right_rig_is_accused_of_nothing() -> None:
     for size, seed in itertools.product((10.0, 10.0 * BLOCK), range(2)):
         loads = pushes(size)
-        found = checked(recorded(loads, seed), loads)
-        assert (found.verdict, found.findings, dict(found.values)) == (RIGHT, (), {})
+        checkup = checked(recorded(loads, seed), loads)
+        assert (checkup.verdict, checkup.findings, dict(checkup.values)) == (RIGHT, (), {})
 
 
 @pytest.mark.slow
@@ -139,17 +139,17 @@ def test_a_psd_on_another_clock_is_told_first_and_no_wire(rows: int, psd: int) -
     loads = np.concatenate([np.zeros((2000, 3)), np.repeat([(0, -10, 0), (0, 0, 0), (12, 0, 0)], 2500, axis=0)])
     loads = np.concatenate([loads, np.repeat([(0, 0, 4), (3, 0, 0), (0, 0, 0)], 1700, axis=0)]).astype(np.float64)
     volts = recorded(loads, 1, every_turn()[1])
-    own, n = slice(3 * psd - 3, 3 * psd), len(volts) - abs(rows)
+    columns, n = slice(3 * psd - 3, 3 * psd), len(volts) - abs(rows)
     moved = volts[max(rows, 0) :][:n].copy()
-    moved[:, own] = volts[max(-rows, 0) :][:n, own]
-    found = checked(moved, loads[max(rows, 0) :][:n])
-    ((late,), (wrong,)) = found.late, found.findings
-    assert (found.verdict, late.where, wrong.name) == (WRONG, f'psd_{psd}', 'channel_sign')
+    moved[:, columns] = volts[max(-rows, 0) :][:n, columns]
+    checkup = checked(moved, loads[max(rows, 0) :][:n])
+    ((late,), (wrong,)) = checkup.late, checkup.findings
+    assert (checkup.verdict, late.where, wrong.name) == (WRONG, f'psd_{psd}', 'channel_sign')
     assert abs(late.seconds - 1e-3 * rows) < 1e-4
-    assert found.sentences()[1].startswith(f'psd_{psd}: on another clock: ')
-    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in found.sentences()[1]
-    assert found.tree()['late'][0]['rows'] == rows
-    assert found.values == lines_of(every_turn()[1])
+    assert checkup.sentences()[1].startswith(f'psd_{psd}: on another clock: ')
+    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in checkup.sentences()[1]
+    assert checkup.tree()['late'][0]['rows'] == rows
+    assert checkup.values == lines_of(every_turn()[1])
 
 
 @pytest.mark.slow
@@ -160,13 +160,13 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     volts = recorded(loads, 2)
     column = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2').index(channel)
     volts[:, column] = 0.1 if stuck else generator.electronic_noise(len(volts), 9)[:, column]
-    found = checked(volts, loads)
-    assert [(f.name, f.where) for f in found.findings] == [('stuck_channel', channel)]
-    assert not found.values
-    (reported,) = [text for text in found.sentences() if text.startswith(channel)]
+    checkup = checked(volts, loads)
+    assert [(f.name, f.where) for f in checkup.findings] == [('stuck_channel', channel)]
+    assert not checkup.values
+    (reported,) = [text for text in checkup.sentences() if text.startswith(channel)]
     assert re.fullmatch(rf'{channel}: [^:]+: .+', reported)
     assert '  ' not in reported
-    assert any(line.startswith(f'  {channel}: ') for line in found.lines())
+    assert any(line.startswith(f'  {channel}: ') for line in checkup.lines())
 
 
 def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
@@ -174,15 +174,15 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
     hum = {'name': 'mains_interference', 'frequency': 60.0, 'amplitude': [0, 4e-3, 0, 0, 1e-3, 0], 'phase': [0.0] * 6}
     volts = recorded(loads, 5, effects=[hum], sigmas=(6e-3,) * 6)
     volts[:, 5] *= 0.7
-    found = checked(volts, loads)
-    (noisy,) = found.findings
-    assert (noisy.name, noisy.fix) == ('noise_level', f'amplifier.noise: {found.values["amplifier.noise"]}')
-    assert found.values['amplifier.noise'] == pytest.approx(6e-3, rel=0.05)
-    np.testing.assert_allclose(found.levels.noise[[0, 1, 3, 4]], 6e-3, rtol=0.05)
-    assert found.levels.hum_hz == 60.0
-    assert found.levels.hum[1] == pytest.approx(4e-3, rel=0.1)
-    assert any('psd_2: sum 3.50 V' in note for note in found.notes)
-    assert any(note.startswith('hum: 4.') for note in found.notes)
+    checkup = checked(volts, loads)
+    (noisy,) = checkup.findings
+    assert (noisy.name, noisy.fix) == ('noise_level', f'amplifier.noise: {checkup.values["amplifier.noise"]}')
+    assert checkup.values['amplifier.noise'] == pytest.approx(6e-3, rel=0.05)
+    np.testing.assert_allclose(checkup.levels.noise[[0, 1, 3, 4]], 6e-3, rtol=0.05)
+    assert checkup.levels.hum_hz == 60.0
+    assert checkup.levels.hum[1] == pytest.approx(4e-3, rel=0.1)
+    assert any('psd_2: sum 3.50 V' in note for note in checkup.notes)
+    assert any(note.startswith('hum: 4.') for note in checkup.notes)
     quiet = checked(recorded(loads, 5), loads)
     assert not quiet.levels.hum.any()
     assert not quiet.notes
@@ -193,7 +193,7 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
 def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> None:
     loads = pushes(50.0)
     rig = load_rig(overrides={'psd_1.sensitivity': [0.4e-3, 0.6e-3], 'psd_2.sensitivity': [0.5e-3, 0.8e-3]})
-    turn = next(
+    wiring = next(
         t for t in every_turn() if list(lines_of(t)) == [f'{name}.axes'] and lines_of(t)[f'{name}.axes'] == ['-y', 'x']
     )
     volts = recorded(loads, 3)
@@ -202,10 +202,10 @@ def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> No
         volts[:, first] *= x
         volts[:, first + 1] *= y
     names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
-    rotated = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (turn[n] for n in names)])
-    found = checked(rotated, loads, rig)
-    assert found.verdict == WRONG
-    assert dict(found.values) == lines_of(turn)
+    rotated = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (wiring[n] for n in names)])
+    checkup = checked(rotated, loads, rig)
+    assert checkup.verdict == WRONG
+    assert dict(checkup.values) == lines_of(wiring)
 
 
 def test_uninformative_loads_or_gaps_cannot_tell() -> None:
@@ -218,8 +218,8 @@ def test_uninformative_loads_or_gaps_cannot_tell() -> None:
     assert checked(volts, late).verdict == CANNOT_TELL
     gaps = volts.copy()
     gaps[::3] = np.nan
-    found = checked(gaps, loads)
-    assert (found.verdict, dict(found.values)) == (RIGHT, {})
+    checkup = checked(gaps, loads)
+    assert (checkup.verdict, dict(checkup.values)) == (RIGHT, {})
     lost = np.where(np.arange(len(volts))[:, None] % 40 < 20, volts, np.nan)
     assert checked(lost, loads).verdict == RIGHT
     with pytest.raises(RecordingError, match='at least 8 are needed'):
@@ -249,8 +249,8 @@ def test_the_printed_lines_put_the_rig_file_right(tmp_path: Path, capsys: pytest
 
 def test_json_has_the_names_that_programs_rely_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     loads = pushes(10.0)
-    turn = {**{n: (n, 1) for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')}, 'y1': ('y1', -1)}
-    recording = str(written(tmp_path / 'pushes.csv', recorded(loads, 8, turn), loads))
+    wiring = {**{n: (n, 1) for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')}, 'y1': ('y1', -1)}
+    recording = str(written(tmp_path / 'pushes.csv', recorded(loads, 8, wiring), loads))
     assert main(['check', recording, '--json']) == 0
     got = json.loads(capsys.readouterr().out)
     assert got['verdict'] == 'wrong'
@@ -306,9 +306,9 @@ def drift_of(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> d
 def test_drift_under_load_steps_is_found_to_1_percent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # 4.5 um/K over 4 K in a minute.
     hidden = ('--temperature', '20,24', '--effect', 'thermal_drift,psd=1,x=4.5e-6')
-    found = drift_of(tmp_path, capsys, '--loads', SWAYS[0].replace(':9', ':15'), *hidden)
-    assert found['drift']['x1'] * 60.0 == pytest.approx(18e-6, rel=0.01)
-    (note,) = [note for note in found['notes'] if 'drift' in note]
+    tree = drift_of(tmp_path, capsys, '--loads', SWAYS[0].replace(':9', ':15'), *hidden)
+    assert tree['drift']['x1'] * 60.0 == pytest.approx(18e-6, rel=0.01)
+    (note,) = [note for note in tree['notes'] if 'drift' in note]
     assert 'on x1; let lasers and amplifier warm up' in note
 
 
@@ -370,15 +370,15 @@ def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float
 
 
 def test_check_and_discover_name_coarser_converter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, found = tmp_path / 'run.csv', tmp_path / 'found'
+    run, folder = tmp_path / 'run.csv', tmp_path / 'found'
     assert main(['simulate', '--out', str(run), '--loads', 'thesis:1', '--world', 'converter.bits=10']) == 0
-    assert main(['discover', str(run), '--out', str(found), '--quiet']) == 0
+    assert main(['discover', str(run), '--out', str(folder), '--quiet']) == 0
     capsys.readouterr()
     assert main(['check', str(run), '--json']) == 0
     checked = json.loads(capsys.readouterr().out)
     # What the steps add to the noise is not said once more.
     assert checked['lines'] == {'converter.bits': 10}
-    searched = json.loads((found / 'result.json').read_text())['setup']
+    searched = json.loads((folder / 'result.json').read_text())['setup']
     for message in (checked['setup'], searched):
         steps = [f for f in message if f['name'] == 'converter_step']
         assert [f['where'] for f in steps] == ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2']
@@ -392,8 +392,8 @@ def test_a_channel_within_a_coarse_step_is_not_dead() -> None:
     volts[:, [0, 1, 3, 4]] += 0.2 * np.sin(np.arange(3000) / 300.0)[:, None]
     coarse = levels(RIG, 0.02 * np.round(volts / 0.02))
     assert coarse.stuck == ()
-    found = check(of_recording(RIG, 0.02 * np.round(volts / 0.02), np.zeros((3000, 3))))
-    assert {f.name for f in found.findings} == {'converter_step', 'load_coverage'}
+    checkup = check(of_recording(RIG, 0.02 * np.round(volts / 0.02), np.zeros((3000, 3))))
+    assert {f.name for f in checkup.findings} == {'converter_step', 'load_coverage'}
     # With a fine converter a channel on which no bit moves is dead.
     volts[:, 5] = 5.0
     assert levels(RIG, volts).stuck == ('sum2',)
@@ -402,19 +402,19 @@ def test_a_channel_within_a_coarse_step_is_not_dead() -> None:
 def test_quantisation_noise_is_step_over_root_12() -> None:
     stated = math.hypot(2e-3, 0.05 / math.sqrt(12.0))
     steps = np.full((2, 2), 0.05)
-    (found,), lines = shared_findings.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)
-    assert (found.name, found.where, found.value) == ('noise_level', 'x1 y1 x2 y2', 3.457)
-    assert found.evidence == pytest.approx(math.log(3.45678))
+    (finding,), lines = shared_findings.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)
+    assert (finding.name, finding.where, finding.value) == ('noise_level', 'x1 y1 x2 y2', 3.457)
+    assert finding.evidence == pytest.approx(math.log(3.45678))
     assert lines == {'amplifier.noise': 6.9e-3}
-    assert found.fix == 'amplifier.noise: 0.0069'
+    assert finding.fix == 'amplifier.noise: 0.0069'
     # Steps that are finer than the file's make no less.
     alone = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
     (same,), _ = shared_findings.noise_findings(RIG, np.full(4, 3.0 * alone), np.zeros((2, 2)))
     assert same.value == 3.0
     # Channels that nobody sees have no say, however coarse they are.
     steps[0, 1] = 5.0
-    (some,), _ = shared_findings.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
-    assert some.value == 3.457
+    (partial,), _ = shared_findings.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
+    assert partial.value == 3.457
     assert shared_findings.noise_findings(RIG, np.zeros(4)) == ([], {})
 
 
@@ -433,14 +433,14 @@ def test_quantisation_noise_is_step_over_root_12() -> None:
 )
 def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: int | None, words: str) -> None:
     rig = load_rig(overrides={'converter.bits': bits})
-    (found,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]))
+    (finding,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]))
     assert lines == ({} if right is None else {'converter.bits': right})
-    assert (found.where, found.value) == ('sum1', step)
-    assert found.evidence == pytest.approx(math.log(step / (20.0 / 2**bits)))
+    assert (finding.where, finding.value) == ('sum1', step)
+    assert finding.evidence == pytest.approx(math.log(step / (20.0 / 2**bits)))
     reported = f'sum1 steps by {words}'
     if words:
-        assert found.fix == (reported if right is None else f'converter.bits: {right} ({reported})')
+        assert finding.fix == (reported if right is None else f'converter.bits: {right} ({reported})')
     # If other channels are finer, no number of bits is right for all.
-    (found,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
+    (finding,), lines = shared_findings.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
     assert lines == {}
-    assert not found.fix.startswith('converter.bits')
+    assert not finding.fix.startswith('converter.bits')

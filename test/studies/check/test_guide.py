@@ -60,8 +60,8 @@ def led(known: Rig, bench: Bench, hand: tuple[FloatArray, ...], most: float = 60
 def hand_of(rig: Rig, size: float, clumsy: float = 0.0) -> tuple[FloatArray, ...]:
     """Loads that move a dot by ``size`` m; ``clumsy``: the share that goes astray. A turn shifts the tip as well."""
     to_load = 1.0 / np.diag(LinkStatics.from_rig(rig).compliance)
-    x, y, turn = np.array([size, clumsy * size, 0.0]), np.array([-clumsy * size, size, 0.0]), size / 0.07
-    twist = np.array([5.0 * clumsy * size, -5.0 * clumsy * size, turn])
+    x, y, rotation = np.array([size, clumsy * size, 0.0]), np.array([-clumsy * size, size, 0.0]), size / 0.07
+    twist = np.array([5.0 * clumsy * size, -5.0 * clumsy * size, rotation])
     return x * to_load, y * to_load, twist * to_load
 
 
@@ -78,21 +78,21 @@ def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     guide, message = led(known, Bench(world, number), hand_of(known, 0.2e-3, clumsy))
     assert guide.phase is Phase.DONE
     assert sum(text.startswith('Got it: ') for text in message) == 3
-    found = verdict(known, guide)
-    assert found.verdict == (WRONG if number else RIGHT)
-    assert dict(found.values) == parameters(wiring, Wiring())
+    checkup = verdict(known, guide)
+    assert checkup.verdict == (WRONG if number else RIGHT)
+    assert dict(checkup.values) == parameters(wiring, Wiring())
     # A hand's turn shifts the tip, so exchanged PSDs look like a turn the other way; that is said.
     if wiring == Wiring(exchanged=True):
-        assert found.findings[0].equivalent == ('load_sign of tz',)
+        assert checkup.findings[0].equivalent == ('load_sign of tz',)
 
 
 def test_a_turn_the_other_way_is_reported_beside_exchanged_psds() -> None:
     known = load_rig()
-    x, y, turn = hand_of(known, 0.2e-3, 0.1)
-    guide, _ = led(known, Bench(known, 1), (x, y, -turn))
-    found = verdict(known, guide)
-    assert [f.name for f in found.findings] == ['psd_swap']
-    assert found.findings[0].equivalent == ('load_sign of tz',)
+    x, y, rotation = hand_of(known, 0.2e-3, 0.1)
+    guide, _ = led(known, Bench(known, 1), (x, y, -rotation))
+    checkup = verdict(known, guide)
+    assert [f.name for f in checkup.findings] == ['psd_swap']
+    assert checkup.findings[0].equivalent == ('load_sign of tz',)
 
 
 MICRO = 1e-6
@@ -122,8 +122,8 @@ class Fed:
 
     def at(self, phase: Phase, progress: float | None = None) -> bool:
         """Whether that is waited for, and so far."""
-        far = self.guide.progress
-        return self.guide.phase is phase and (progress is None or math.isclose(far, progress, abs_tol=1e-9))
+        reached = self.guide.progress
+        return self.guide.phase is phase and (progress is None or math.isclose(reached, progress, abs_tol=1e-9))
 
     def rested(self, shaking: float = 0.0) -> Fed:
         """After the first rest, two seconds of it."""
@@ -326,9 +326,9 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     logged: list[str] = []
     shown: list[float] = []
     world = load_rig(overrides={'psd_1.axes': ['-y', 'x'], 'psds_exchanged': True})
-    found = run_guided(load_rig(), world, texts(logged.append), lambda guide: shown.append(guide.progress))
-    assert found.verdict == WRONG
-    assert dict(found.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
+    checkup = run_guided(load_rig(), world, texts(logged.append), lambda guide: shown.append(guide.progress))
+    assert checkup.verdict == WRONG
+    assert dict(checkup.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
     prompts = [text[:12] for text in logged if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
     assert prompts == ['Leave the li', '1 of 3: Push', 'Let go.', '2 of 3: Push', 'Let go.', '3 of 3: Turn', 'Let go.']
     assert max(shown) > 0.9

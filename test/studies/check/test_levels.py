@@ -42,7 +42,7 @@ def test_noise_is_that_of_third_differences() -> None:
     volts[::90] -= 0.5
     volts += 1e-6 * np.arange(800.0)[:, None] ** 2
     volts[[100, 333]] = np.nan
-    found = levels(RIG, volts)
+    measured = levels(RIG, volts)
     for channel in range(6):
         v = volts[:, channel]
         rough = [v[i + 3] - 3.0 * v[i + 2] + 3.0 * v[i + 1] - v[i] for i in range(797)]
@@ -52,9 +52,9 @@ def test_noise_is_that_of_third_differences() -> None:
         clipped = [min(max(r, -most), most) for r in rough]
         # The variance of 1, 3, 3, 1 times white noise is 20.
         wanted = math.sqrt(sum(c * c for c in clipped) / len(clipped) / 20.0)
-        assert found.noise[channel] == pytest.approx(wanted)
-    assert found.sums == pytest.approx(np.nanmean(volts[:, [2, 5]], axis=0))
-    assert found.stuck == ()
+        assert measured.noise[channel] == pytest.approx(wanted)
+    assert measured.sums == pytest.approx(np.nanmean(volts[:, [2, 5]], axis=0))
+    assert measured.stuck == ()
     # Of samples between lost ones nothing is told, and the least is the converter's step.
     alone = np.where(np.arange(30)[:, None] % 3 == 0, noisy(30), np.nan)
     assert levels(RIG, alone).noise.tolist() == [0.0] * 6
@@ -74,9 +74,9 @@ def test_constant_channel_is_stuck_if_noise_moves_bits() -> None:
 
 
 def test_one_sample_has_no_noise() -> None:
-    found = levels(RIG, noisy(1))
-    assert found.noise.tolist() == [0.0] * 6
-    assert found.sums == pytest.approx(noisy(1)[0, [2, 5]])
+    measured = levels(RIG, noisy(1))
+    assert measured.noise.tolist() == [0.0] * 6
+    assert measured.sums == pytest.approx(noisy(1)[0, [2, 5]])
 
 
 def waves(n: int, rate: float, amplitudes: dict[float, float]) -> FloatArray:
@@ -144,10 +144,10 @@ def test_push_moves_channels_as_its_load_does_at_rest(rig: Rig) -> None:
     volts[:, 3] += 1e-6 / 5e-4 * np.arange(len(loads)) * 1e-3
     volts[1000:1100] = np.nan
     volts[:, [0, 1, 3, 4]] += np.random.default_rng(1).normal(0.0, 1e-4, (len(loads), 4))
-    found = responses(rig, volts, loads)
-    assert [p.loads for p in found.pushes] == [('fx',), ('fy',), ('tz',)]
+    response = responses(rig, volts, loads)
+    assert [p.loads for p in response.pushes] == [('fx',), ('fy',), ('tz',)]
     # The largest of each is told, with the sign of the way that the push is named.
-    for push, load in zip(found.pushes, ((5.0, 0.0, 0.0), (0.0, -10.0, 0.0), (0.0, 0.0, 3.0)), strict=True):
+    for push, load in zip(response.pushes, ((5.0, 0.0, 0.0), (0.0, -10.0, 0.0), (0.0, 0.0, 3.0)), strict=True):
         moved = np.sign(sum(load)) * at_rest(rig, load)
         assert push.expected == pytest.approx(moved, abs=1e-9)
         observed = push.channels * np.array(push.scales)
@@ -158,9 +158,9 @@ def test_push_moves_channels_as_its_load_does_at_rest(rig: Rig) -> None:
         assert (push.sd > 5e-10).all()
         assert push.sized
         assert push.scales == pytest.approx((rig.sensitivities.ravel() / 5e-4).tolist())
-    assert found.drift == pytest.approx([0.0, 0.0, 1e-6, 0.0], abs=2e-8)
-    assert (np.abs(found.drift - (0.0, 0.0, 1e-6, 0.0)) < 5.0 * found.drift_sd).all()
-    assert (found.drift_sd < 2e-8).all()
+    assert response.drift == pytest.approx([0.0, 0.0, 1e-6, 0.0], abs=2e-8)
+    assert (np.abs(response.drift - (0.0, 0.0, 1e-6, 0.0)) < 5.0 * response.drift_sd).all()
+    assert (response.drift_sd < 2e-8).all()
 
 
 def test_loads_that_came_together_are_reported_at_their_largest() -> None:
@@ -258,8 +258,8 @@ def test_unexplained_share_is_square_outside_pattern() -> None:
     scaled = push([3.0, 4.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], scales=(2.0, 0.5, 1.0, 1.0))
     assert scaled.match(PLAIN) == pytest.approx((4.0 / 40.0, 3.0))
     # Of a turn the difference of the dots: (3 - 1, 4 - 0) along (2 - 0, 0).
-    turn = push([3.0, 4.0, 1.0, 0.0], [2.0, 0.0, 0.0, 0.0], only_twist=True)
-    assert turn.match(PLAIN) == pytest.approx((16.0 / 20.0, 1.0))
+    twist = push([3.0, 4.0, 1.0, 0.0], [2.0, 0.0, 0.0, 0.0], only_twist=True)
+    assert twist.match(PLAIN) == pytest.approx((16.0 / 20.0, 1.0))
     # With the wiring turned the PSDs see x1 = -y2, y1 = x2, x2 = x1, y2 = y1.
     assert push([7.0, 8.0, 3.0, 4.0], [-4.0, 3.0, 7.0, 8.0]).match(ROTATED) == pytest.approx((0.0, 1.0), abs=1e-12)
 
@@ -276,9 +276,9 @@ def of_plate(*rows: tuple[str, float], lean: float = 0.0) -> list[wirings.PushRe
 
 
 def test_three_pushes_leave_one_wiring_and_two_leave_several() -> None:
-    found = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0), ('tz', 10.0)))
-    assert [(f.wiring, f.reversed_loads) for f in found] == [(PLAIN, ())]
-    assert found[0].residual == pytest.approx(0.0, abs=1e-12)
+    fits = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0), ('tz', 10.0)))
+    assert [(f.wiring, f.reversed_loads) for f in fits] == [(PLAIN, ())]
+    assert fits[0].residual == pytest.approx(0.0, abs=1e-12)
     # Along X and Y both PSDs move alike: they may be exchanged.
     both = wirings.fitting_wirings(of_plate(('fx', 1.0), ('fy', 1.0)))
     assert [f.wiring for f in both] == [PLAIN, Wiring(exchanged=True)]
@@ -366,15 +366,15 @@ def checked(
     return check(CheckProblem(rig, pushes, levels or of_levels(), *drifting, source='x', notes=notes))
 
 
-def of(found: Checkup) -> list[tuple[str, str]]:
-    return [(f.name, f.where) for f in found.findings]
+def of(checkup: Checkup) -> list[tuple[str, str]]:
+    return [(f.name, f.where) for f in checkup.findings]
 
 
 def test_channel_below_a_tenth_of_every_push_is_dead() -> None:
     def with_share(share: float, only_twist: bool = False) -> Checkup:
         fx = replace(push_of('fx'), channels=np.array([share, 0.0, math.sqrt(1.0 - share**2), 0.0]) * -1e-4)
-        turn = replace(push_of('tz'), channels=np.array([0.0, 0.0, 0.0, 1e-4]), only_twist=only_twist)
-        return checked([fx, push_of('fy'), turn])
+        tz = replace(push_of('tz'), channels=np.array([0.0, 0.0, 0.0, 1e-4]), only_twist=only_twist)
+        return checked([fx, push_of('fy'), tz])
 
     assert of(with_share(0.099)) == [('stuck_channel', 'x1')]
     assert with_share(0.099).findings[0].fix == 'x1 does not answer: look at its cable'
@@ -392,9 +392,9 @@ def test_channel_below_a_tenth_of_every_push_is_dead() -> None:
 
 def test_stuck_channel_is_reported_once_without_wiring() -> None:
     dead = replace(push_of('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
-    found = checked([dead, push_of('fy')], of_levels(stuck=('x1', 'sum2')))
-    assert of(found) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
-    assert found.verdict == WRONG
+    checkup = checked([dead, push_of('fy')], of_levels(stuck=('x1', 'sum2')))
+    assert of(checkup) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
+    assert checkup.verdict == WRONG
     rotated = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push_of(load, 9.80665, rotated) for load in ('fx', 'fy', 'tz')]
     assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
@@ -403,49 +403,49 @@ def test_stuck_channel_is_reported_once_without_wiring() -> None:
 def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     wiring = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push_of(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')]
-    found = checked(three)
-    assert of(found) == [('channel_sign', 'x1')]
-    assert dict(found.values) == {'psd_1.axes': ['-x', 'y']}
+    checkup = checked(three)
+    assert of(checkup) == [('channel_sign', 'x1')]
+    assert dict(checkup.values) == {'psd_1.axes': ['-x', 'y']}
     # By the file a push along X is opposite on x1, which leaves all of it; one turn is opposite, too.
-    assert found.findings[0].evidence == pytest.approx(1.0 + 1.0 - 0.0, abs=0.7)
-    assert found.findings[0].evidence > 1.0
-    assert found.findings[0].equivalent == ()
+    assert checkup.findings[0].evidence == pytest.approx(1.0 + 1.0 - 0.0, abs=0.7)
+    assert checkup.findings[0].evidence > 1.0
+    assert checkup.findings[0].equivalent == ()
     two = checked(three[:2])
     assert two.verdict == WRONG
     assert dict(two.values) == {}
     assert len(two.wirings) == 2
     assert two.findings[0].equivalent == ('1 other wiring, which these pushes cannot tell apart',)
-    one = checked(three[:1])
-    others = len(one.wirings) - 1
-    assert others > 1
-    assert one.findings[0].equivalent == (f'{others} other wirings, which these pushes cannot tell apart',)
+    single = checked(three[:1])
+    count = len(single.wirings) - 1
+    assert count > 1
+    assert single.findings[0].equivalent == (f'{count} other wirings, which these pushes cannot tell apart',)
 
 
 def test_all_signs_turned_may_be_the_loads_as_well() -> None:
     wiring = Wiring(False, (('-x', '-y'), ('-x', '-y')))
-    found = checked([push_of(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')])
-    assert {f.equivalent for f in found.findings} == {('load_sign of fx fy tz',)}
+    checkup = checked([push_of(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')])
+    assert {f.equivalent for f in checkup.findings} == {('load_sign of fx fy tz',)}
     # By the file each push goes the other way and leaves nothing of its own: three that are not explained at all.
-    assert [f.evidence for f in found.findings] == pytest.approx([3.0] * 4)
+    assert [f.evidence for f in checkup.findings] == pytest.approx([3.0] * 4)
     # If one of the loads went the other way too, only the others are turned: half as far as expected.
     other = checked([push_of('fx', 1.0, wiring), push_of('fy', 1.0, wiring), push_of('tz', -0.5, wiring)])
     assert ('load_sign of fx fy',) in {f.equivalent for f in other.findings}
     # A push that leans leaves 0.04 of 1.04 of the best one as well.
     lean = replace(push_of('fx', 1.0, wiring), channels=np.array([1.0, 0.2, 1.0, 0.2]) * 1e-4)
-    found = checked([lean, *(push_of(load, 1.0, wiring) for load in ('fy', 'tz'))])
-    assert [f.evidence for f in found.findings] == pytest.approx([3.0 - 0.04 / 1.04] * 4)
+    checkup = checked([lean, *(push_of(load, 1.0, wiring) for load in ('fy', 'tz'))])
+    assert [f.evidence for f in checkup.findings] == pytest.approx([3.0 - 0.04 / 1.04] * 4)
     # A push that leans leaves 0.36 of it, beyond the limit: then the loads are no other explanation.
     lean = replace(push_of('fx', 1.0, wiring), channels=np.array([1.0, 0.75, 1.0, 0.75]) * 1e-4)
-    found = checked([lean, *(push_of(load, 1.0, wiring) for load in ('fy', 'tz'))])
-    assert not any('load_sign' in text for f in found.findings for text in f.equivalent)
+    checkup = checked([lean, *(push_of(load, 1.0, wiring) for load in ('fy', 'tz'))])
+    assert not any('load_sign' in text for f in checkup.findings for text in f.equivalent)
 
 
 def test_a_load_of_the_other_sign_is_reported() -> None:
-    found = checked([push_of('fx'), push_of('fy'), push_of('tz', -1.0)])
-    assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [
+    checkup = checked([push_of('fx'), push_of('fy'), push_of('tz', -1.0)])
+    assert [(f.name, f.where, f.value, f.fix) for f in checkup.findings] == [
         ('load_sign', 'tz', -1.0, 'load_tz in the recording has the wrong sign')
     ]
-    assert found.sizes == pytest.approx([1.0, 1.0, -1.0])
+    assert checkup.sizes == pytest.approx([1.0, 1.0, -1.0])
 
 
 @pytest.mark.parametrize(
@@ -462,12 +462,12 @@ def test_a_load_of_the_other_sign_is_reported() -> None:
     ],
 )
 def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
-    found = checked([push_of('fx'), push_of('fy'), push_of('tz', size)])
+    checkup = checked([push_of('fx'), push_of('fy'), push_of('tz', size)])
     words = (
         f'+θ: the dots move {reported} times what the rig file expects; see its link and amplifier.sensitivity '
         '(`psd-deflection discover` names the cause)'
     )
-    assert found.notes == ((words,) if reported else ())
+    assert checkup.notes == ((words,) if reported else ())
     # By hand nobody knows how far.
     assert checked([push_of('fx'), push_of('fy'), push_of('tz', size, sized=False)]).notes == ()
 
@@ -496,19 +496,19 @@ def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
     ],
 )
 def test_what_is_missing_is_asked_for(pushes: list[wirings.PushResponse], where: str, fix: str) -> None:
-    found = checked(pushes)
-    assert found.verdict == CANNOT_TELL
-    assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [('load_coverage', where, None, fix)]
-    assert [math.isnan(s) for s in found.sizes] == [not p.observed for p in pushes]
+    checkup = checked(pushes)
+    assert checkup.verdict == CANNOT_TELL
+    assert [(f.name, f.where, f.value, f.fix) for f in checkup.findings] == [('load_coverage', where, None, fix)]
+    assert [math.isnan(s) for s in checkup.sizes] == [not p.observed for p in pushes]
 
 
 def test_pushes_that_no_wiring_explains_are_asked_for_again() -> None:
     odd = [replace(push_of('fx'), channels=np.array([-1.0, 1.0, 1.0, 1.0]) * 1e-4), push_of('fy'), push_of('tz')]
     odd[0] = replace(odd[0], channels=np.array([-1.0, 1.0, -1.0, 1.0]) * 1e-4)
-    found = checked(odd)
-    assert found.wirings == ()
-    assert found.verdict == CANNOT_TELL
-    assert [(f.where, f.fix) for f in found.findings] == [
+    checkup = checked(odd)
+    assert checkup.wirings == ()
+    assert checkup.verdict == CANNOT_TELL
+    assert [(f.where, f.fix) for f in checkup.findings] == [
         ('fx fy tz', 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ')
     ]
     # Of a wrong wiring several are left: that is wrong, and more is asked for too.
@@ -531,9 +531,9 @@ def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:
     pushes = [push_of(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')]
     assert checked(pushes, of_levels(noise), rig=rig).findings == ()
     noise[4] = 9e-3
-    found = checked(pushes, of_levels(noise), rig=rig)
-    assert of(found) == [('noise_level', 'x1')]
-    assert dict(found.values) == {'psd_1.noise': [9e-3, 2e-3]}
+    checkup = checked(pushes, of_levels(noise), rig=rig)
+    assert of(checkup) == [('noise_level', 'x1')]
+    assert dict(checkup.values) == {'psd_1.noise': [9e-3, 2e-3]}
 
 
 @pytest.mark.parametrize(
@@ -547,10 +547,10 @@ def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:
     ],
 )
 def test_a_sum_between_its_limits_is_light_enough(sums: tuple[float, float], light: dict[str, str]) -> None:
-    found = checked(levels=of_levels(sums=sums))
-    assert list(found.light) == list(light)
-    assert all(found.light[psd].startswith(words) for psd, words in light.items())
-    assert found.verdict == (WRONG if light else RIGHT)
+    checkup = checked(levels=of_levels(sums=sums))
+    assert list(checkup.light) == list(light)
+    assert all(checkup.light[psd].startswith(words) for psd, words in light.items())
+    assert checkup.verdict == (WRONG if light else RIGHT)
     # Exchanged PSDs have the light of the other input.
     rig = load_rig(overrides={'psds_exchanged': True})
     other = [push_of(load, 1.0, Wiring(exchanged=True)) for load in ('fx', 'fy', 'tz')]
@@ -564,9 +564,9 @@ def test_a_sum_between_its_limits_is_light_enough(sums: tuple[float, float], lig
     ('level', 'reported'), [(5.74, False), (5.76, True), (4.35, False), (4.34, True), (7.5, True), (7.6, False)]
 )
 def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, reported: bool) -> None:
-    found = checked(levels=of_levels(sums=(5.0, level)))
+    checkup = checked(levels=of_levels(sums=(5.0, level)))
     words = f'psd_2: sum {level:.2f} V, the rig file says 5 V; see amplifier.sum_nominal'
-    assert found.notes == ((words,) if reported else ())
+    assert checkup.notes == ((words,) if reported else ())
 
 
 @pytest.mark.parametrize(

@@ -78,14 +78,14 @@ def fits(count: int) -> tuple[WiringFit, ...]:
     ],
 )
 def test_the_verdict_is_a_sentence(verdict: str, names: tuple[str, ...], count: int, words: str) -> None:
-    some = tuple(finding(name, 'x1') for name in names)
-    found = replace(CHECKUP, verdict=verdict, findings=some, wirings=fits(count))
-    assert found.sentences()[0] == words
-    assert words in found.lines()
+    findings = tuple(finding(name, 'x1') for name in names)
+    checkup = replace(CHECKUP, verdict=verdict, findings=findings, wirings=fits(count))
+    assert checkup.sentences()[0] == words
+    assert words in checkup.lines()
 
 
 def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
-    found = replace(
+    checkup = replace(
         CHECKUP,
         verdict=WRONG,
         findings=(
@@ -102,7 +102,7 @@ def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
         'or else: the rig file is right, and +X, +θ went the other way (sign of the load); this would look the same',
         'or else: another',
     ]
-    assert found.sentences()[1:] == [
+    assert checkup.sentences()[1:] == [
         'psd_1 and psd_2: exchanged: psds_exchanged: true',
         'pushes: not enough to tell: push',
         'load_fx: not seen: note it',
@@ -111,9 +111,9 @@ def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
         *causes,
         'note: hum',
     ]
-    assert other_causes(found) == causes
-    lines = found.lines()
-    at = lines.index(found.sentences()[0])
+    assert other_causes(checkup) == causes
+    lines = checkup.lines()
+    at = lines.index(checkup.sentences()[0])
     assert lines[at + 1 : at + 14] == [
         '  psd_1 and psd_2: exchanged   psds_exchanged: true',
         '  pushes: not enough to tell   push',
@@ -130,10 +130,10 @@ def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
     ]
     assert lines[-1] == 'note     hum'
     assert lines[-2].startswith('drift    x1')
-    titles = [section.title for section in found.sections()]
+    titles = [section.title for section in checkup.sections()]
     assert titles == ['How each channel answered', 'Lines for the rig file', 'Noise, light and drift']
     assert [s.title for s in CHECKUP.sections()] == [titles[0], titles[2]]
-    (first, *_) = found.sections()
+    (first, *_) = checkup.sections()
     assert len(first.parts) == 2
     (first, *_) = replace(CHECKUP, pushes=(), sizes=()).sections()
     assert len(first.parts) == 1
@@ -146,8 +146,8 @@ def test_push_rows_list_expected_channels_of_rig_file() -> None:
     assert along == ['+X', '+1.0', '-2.0', '+0.0', '+4.0', '  rig file:', '+', '0', '+', '0', '']
     assert beside == ['+Y with +θ', '+0.0', '+0.0', '+0.0', '+1000.0', '  rig file:', '0', '+', '0', '-', '0.50']
     # Rounded to a tenth of a micrometre.
-    near = replace(PUSHES[0], channels=np.array([1.0499995e-6, 1.0500005e-6, 0.0, 0.0]))
-    assert push_rows(replace(CHECKUP, pushes=(near,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
+    rounded = replace(PUSHES[0], channels=np.array([1.0499995e-6, 1.0500005e-6, 0.0, 0.0]))
+    assert push_rows(replace(CHECKUP, pushes=(rounded,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
     assert [row[-1] for row in push_rows(replace(CHECKUP, pushes=PUSHES[::-1]))] == ['size', '1.50', '']
     assert [len(row) for row in push_rows(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
@@ -169,13 +169,13 @@ def test_levels_are_in_mv_and_drift_in_um_per_minute() -> None:
         'x1 0.0  y1 1.0  sum1 0.0  x2 2.5  y2 0.0  sum2 0.0  mV at 60 Hz',
     )
     minute = 1e-6 / 60.0
-    near = replace(
+    rounded = replace(
         CHECKUP,
         drift=minute * np.array([1.04999999, 1.05000001, 0.0, 0.0]),
         drift_sd=minute * np.array([2.24999998, 2.25000002, 0.0, 0.0]),
         levels=replace(LEVELS, hum=np.array([1.0495e-3, 1.0505e-3, 0.0, 0.0, 0.0, 0.0]), stated=2.2245e-3),
     )
-    reported = dict(level_rows(near))
+    reported = dict(level_rows(rounded))
     assert reported['drift'].startswith('x1 +1.0 ± 2.2  y1 +1.1 ± 2.3  ')
     assert reported['hum'].startswith('x1 1.0  y1 1.1  ')
     assert reported['noise'].endswith('(rig file 2.22)')
@@ -186,11 +186,11 @@ def test_levels_are_in_mv_and_drift_in_um_per_minute() -> None:
 
 
 def test_the_tree_and_the_table_have_all_numbers() -> None:
-    found = replace(CHECKUP, verdict=WRONG, findings=(finding('channel_sign', 'x1', 'turn', ('a',)),), source='run.csv')
-    assert found.sources == {'recording': 'run.csv'}
+    wrong = replace(CHECKUP, verdict=WRONG, findings=(finding('channel_sign', 'x1', 'turn', ('a',)),), source='run.csv')
+    assert wrong.sources == {'recording': 'run.csv'}
     assert CHECKUP.sources == {}
-    tree = found.tree()
-    assert tree['setup'] == [finding_tree(found.findings[0])]
+    tree = wrong.tree()
+    assert tree['setup'] == [finding_tree(wrong.findings[0])]
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'x1', 'value': 1.5, 'fix': 'turn', 'evidence': 0.25, 'equivalent': ['a']}
     ]
@@ -203,7 +203,7 @@ def test_the_tree_and_the_table_have_all_numbers() -> None:
     assert tree['hum'] == {'hz': 50.0, 'x1': 0.0, 'y1': 0.0, 'sum1': 0.0, 'x2': 0.0, 'y2': 0.0, 'sum2': 0.0}
     assert tree['sums'] == [4.5, 5.25]
     assert tree['wirings_that_fit'] == [{'psds_exchanged': False, 'psd_1.axes': ['x', 'y'], 'psd_2.axes': ['x', 'y']}]
-    table = found.table()
+    table = wrong.table()
     assert table.attributes == {'verdict': WRONG}
     assert [c.name for c in table.columns] == ['where', 'value', 'fix', 'evidence']
     assert [c.values[0] for c in table.columns] == ['x1', 1.5, 'turn', 0.25]

@@ -207,9 +207,9 @@ def declared(*parameters: EffectParameter, **given: Any) -> Effect:
     return Effect(summary='', equation='', source='', needs='', parameters=parameters, **{**full, **given})
 
 
-def listed(effect: Effect, **found: list[float]) -> list[Candidate]:
+def listed(effect: Effect, **columns: list[float]) -> list[Candidate]:
     """Its candidates."""
-    return list(candidates([effect], Physics.of(RIG), found))
+    return list(candidates([effect], Physics.of(RIG), columns))
 
 
 def test_a_candidate_has_its_choices_and_shapes_fixed() -> None:
@@ -327,19 +327,19 @@ def test_a_step_is_coarse_from_three_counts_on(counts: float, observed: bool) ->
     k = np.rint(rng.uniform(-300, 300, (2000, 6)))
     volts = np.rint(k * counts) * lsb
     o = dataclasses.replace(make_observation(), volts=volts, loads=np.zeros((2000, 3)), temperature=None)
-    found = proposals.coarse_step(o)
-    assert (found is not None) == observed
-    if found is not None:
+    coarse = proposals.coarse_step(o)
+    assert (coarse is not None) == observed
+    if coarse is not None:
         values = np.unique(k)
-        assert found[0] == pytest.approx(float(values @ np.rint(values * counts) / (values @ values)) * lsb, rel=1e-9)
-        assert found[1] == pytest.approx(lsb / math.sqrt(12.0 * float(values @ values)), rel=1e-9)
+        assert coarse[0] == pytest.approx(float(values @ np.rint(values * counts) / (values @ values)) * lsb, rel=1e-9)
+        assert coarse[1] == pytest.approx(lsb / math.sqrt(12.0 * float(values @ values)), rel=1e-9)
         # The readings are put on it; if the rig file states steps, it is no news.
         for known in ((), (make_active('quantisation', {'step': 0.5}, 'test'),)):
             ready = snapped(Recorded((o,), RIG, known))
             assert (ready.stated, ready.known, ready.value_grid_stated) == (known, (), bool(known))
             assert ready.value_grid is not None
-            assert ready.value_grid.values['step'] == (0.5 if known else found[0])
-            np.testing.assert_allclose(ready.observations[0].volts, k * found[0], rtol=1e-9)
+            assert ready.value_grid.values['step'] == (0.5 if known else coarse[0])
+            np.testing.assert_allclose(ready.observations[0].volts, k * coarse[0], rtol=1e-9)
     # Readings between the steps, and there are none; few values prove nothing.
     off = o.volts.copy()
     off[::50] += 0.31 * counts * lsb
@@ -525,18 +525,18 @@ HIDDEN = {'psd': 2, 'angle': 0.03}
 
 
 @pytest.fixture(scope='module')
-def found() -> Discovery:
+def study() -> Discovery:
     """A turned sensor in 1.2 s, looked for among three effects."""
     o = make_observation(9, (make_active('sensor_rotation', HIDDEN, 'test'),))
     return discover([o], RIG, without=[name for name in EVERY if name not in FEW])
 
 
-def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> None:
+def test_every_number_of_the_answer_is_that_of_its_model(study: Discovery) -> None:
     """Gaps from simulations made here: rms of block means of 20 samples over the four dots, m."""
-    (named,) = found.effects
+    (named,) = study.effects
     assert named.active.effect.name == 'sensor_rotation'
     assert abs(named.active.values['angle'] - 0.03) < 4.0 * named.sd['angle']
-    (o,) = found.workspace.observations
+    (o,) = study.workspace.observations
 
     def gaps(*effects: ActiveEffect) -> FloatArray:
         off = o.volts - ForwardModel(RIG, list(effects)).expect(o.loads, o.temperature).volts.T
@@ -545,63 +545,63 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
         return np.asarray(np.sqrt(np.mean(blocks**2, axis=0)))
 
     before, after = gaps(), gaps(named.active)
-    assert found.gap_before == found.gap_heldout_before == pytest.approx(float(np.sqrt(np.mean(before**2))), rel=1e-6)
-    assert found.gap_after == pytest.approx(float(np.sqrt(np.mean(after**2))), rel=1e-6)
+    assert study.gap_before == study.gap_heldout_before == pytest.approx(float(np.sqrt(np.mean(before**2))), rel=1e-6)
+    assert study.gap_after == pytest.approx(float(np.sqrt(np.mean(after**2))), rel=1e-6)
     for i, name in enumerate(('x1', 'y1', 'x2', 'y2')):
-        assert found.per_channel[name] == pytest.approx((before[i], after[i]), rel=1e-6)
+        assert study.per_channel[name] == pytest.approx((before[i], after[i]), rel=1e-6)
     floor = float(
-        np.sqrt(np.mean((found.workspace.noise[0].sigma[[0, 1, 3, 4]] * RIG.sensitivities.ravel()) ** 2 / 20.0))
+        np.sqrt(np.mean((study.workspace.noise[0].sigma[[0, 1, 3, 4]] * RIG.sensitivities.ravel()) ** 2 / 20.0))
     )
-    assert found.gap_floor == pytest.approx(floor, rel=1e-6)
-    assert found.floors == pytest.approx(found.gap_after / floor)
-    assert found.gap_heldout_after == pytest.approx(found.gap_after, rel=0.1)
-    assert found.gap_heldout_after > found.gap_after
-    assert found.waterfall == (
-        ('as described', found.gap_before),
-        ('+ sensor_rotation', found.gap_after),
-        ('noise alone', found.gap_floor),
+    assert study.gap_floor == pytest.approx(floor, rel=1e-6)
+    assert study.floors == pytest.approx(study.gap_after / floor)
+    assert study.gap_heldout_after == pytest.approx(study.gap_after, rel=0.1)
+    assert study.gap_heldout_after > study.gap_after
+    assert study.waterfall == (
+        ('as described', study.gap_before),
+        ('+ sensor_rotation', study.gap_after),
+        ('noise alone', study.gap_floor),
     )
-    assert (found.verdict, found.unknown, found.setup, found.law, found.values) == ('effects_found', (), (), None, {})
-    assert (found.seed, found.known, found.alternative_fits, found.unsettled) == (0, (), (), ())
-    assert found.active_effects == [named.active]
+    assert (study.verdict, study.unknown, study.setup, study.law, study.values) == ('effects_found', (), (), None, {})
+    assert (study.seed, study.known, study.alternative_fits, study.unsettled) == (0, (), (), ())
+    assert study.active_effects == [named.active]
     h = 1e-4
     plus = ActiveEffect(named.active.effect, {**named.active.values, 'angle': named.active.values['angle'] + h})
     slope = (
         ForwardModel(RIG, [plus]).expect(o.loads, o.temperature).volts
         - ForwardModel(RIG, [named.active]).expect(o.loads, o.temperature).volts
     ) / h
-    sigma = found.workspace.noise[0].sigma
+    sigma = study.workspace.noise[0].sigma
     information = float(((slope / sigma[:, None]) ** 2).sum())
     assert named.sd['angle'] == pytest.approx(information**-0.5, rel=0.01)
-    gain = found.search.null.chi2 - found.fit.chi2
+    gain = study.search.null.chi2 - study.fit.chi2
     assert named.delta_bic == pytest.approx(gain - math.log(6 * 1200 / 20), rel=1e-9)
     assert named.heldout.gain == pytest.approx(0.5 * gain, rel=0.05)
     assert named.p == 0.0 or named.p < 1e-12
-    assert repr(found) == (
-        f'<Discovery effects_found: sensor_rotation (psd 2); gap {1e6 * found.gap_before:.3g} µm → '
-        f'{1e6 * found.gap_after:.3g} µm (noise alone: {1e6 * found.gap_floor:.3g} µm)>'
+    assert repr(study) == (
+        f'<Discovery effects_found: sensor_rotation (psd 2); gap {1e6 * study.gap_before:.3g} µm → '
+        f'{1e6 * study.gap_after:.3g} µm (noise alone: {1e6 * study.gap_floor:.3g} µm)>'
     )
-    assert {c.channel for c in found.where.cells[:2]} <= {'x2', 'y2'}
+    assert {c.channel for c in study.where.cells[:2]} <= {'x2', 'y2'}
     # Reading the answer costs simulations too.
-    assert 0 < found.simulations <= found.workspace.simulations
+    assert 0 < study.simulations <= study.workspace.simulations
 
 
-def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
-    tree = found.tree()
-    (named,) = found.effects
+def test_the_answer_is_written_as_it_is(study: Discovery) -> None:
+    tree = study.tree()
+    (named,) = study.effects
     assert tree['gap'] == {
         'unit': 'm',
-        'before': found.gap_before,
-        'after': found.gap_after,
-        'floor': found.gap_floor,
-        'heldout_before': found.gap_heldout_before,
-        'heldout_after': found.gap_heldout_after,
+        'before': study.gap_before,
+        'after': study.gap_after,
+        'floor': study.gap_floor,
+        'heldout_before': study.gap_heldout_before,
+        'heldout_after': study.gap_heldout_after,
         'per_channel': {
-            k: {'before': a, 'after': b, 'heldout': found.heldout_per_channel[k]}
-            for k, (a, b) in found.per_channel.items()
+            k: {'before': a, 'after': b, 'heldout': study.heldout_per_channel[k]}
+            for k, (a, b) in study.per_channel.items()
         },
     }
-    assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
+    assert tree['remaining'] == {'rms': study.gap_after, 'floors': study.floors}
     (effect,) = tree['effects']
     assert effect['name'] == 'sensor_rotation'
     assert effect['stage'] == 'psd'
@@ -612,27 +612,27 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
         'heldout_gain_error': named.heldout.error,
     }
     assert (effect['suggested_experiment'], effect['rivals'], effect['equivalent']) == (None, [], [])
-    cells = [c for c in found.where.cells if c.p < 0.05]
+    cells = [c for c in study.where.cells if c.p < 0.05]
     assert [(w['channel'], w['recording'], w['when'], w['band_hz']) for w in tree['where']] == [
         (c.channel, 'seen', list(c.when), list(c.band)) for c in cells
     ]
     assert [w['statistic'] for w in tree['where']] == [c.statistic for c in cells]
     assert [w['depends_on'] for w in tree['where']] == [list(c.depends_on) for c in cells]
     source = tree['provenance']
-    assert (source['version'], source['seed'], source['forward_simulations']) == (__version__, 0, found.simulations)
-    (o,) = found.workspace.observations
+    assert (source['version'], source['seed'], source['forward_simulations']) == (__version__, 0, study.simulations)
+    (o,) = study.workspace.observations
     (recording,) = source['recordings']
     assert recording['sha256'] == o.hashed()
     assert recording['seconds'] == pytest.approx(1.2)
-    assert recording['noise_v'] == found.workspace.noise[0].sigma.tolist()
+    assert recording['noise_v'] == study.workspace.noise[0].sigma.tolist()
     assert recording['coloured'] == [False] * 6
-    before, left = 1e6 * found.gap_before, 1e6 * found.gap_after
+    before, after = 1e6 * study.gap_before, 1e6 * study.gap_after
     size = trees.size_of(named)
-    dx, dy, theta = (1e6 * v for v in found.moves)
+    dx, dy, theta = (1e6 * v for v in study.moves)
     off = f'ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad'
-    assert found.sentence == (
-        f'sensor_rotation (psd 2) is missing from the model; adding it closes the gap from {before:.3f} to {left:.3f} '
-        f'µm, {found.floors:.2f} times the noise floor ({1e6 * found.gap_floor:.3f} µm). '
+    assert study.sentence == (
+        f'sensor_rotation (psd 2) is missing from the model; adding it closes the gap from {before:.3f} to {after:.3f} '
+        f'µm, {study.floors:.2f} times the noise floor ({1e6 * study.gap_floor:.3f} µm). '
         f'Fitted: sensor_rotation {size}. Without it an estimate is wrong by up to {off}.'
     )
 
@@ -641,15 +641,15 @@ def named_as(name: str, **values: float) -> NamedEffect:
     return NamedEffect(make_active(name, values, 'test'), {}, 0.0, 100.0, HeldOut(1.0, 0.1), (), (), (), None)
 
 
-def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery) -> None:
-    rotated, lag = found.effects[0], named_as('amplifier_lag', time_constant=1e-4)
+def test_an_estimate_is_called_wrong_only_for_what_is_corrected(study: Discovery) -> None:
+    rotated, lag = study.effects[0], named_as('amplifier_lag', time_constant=1e-4)
     soft = named_as('bending_stiffness', scale=-0.02)
     right = 'The estimates of the pose are right without; the simulated motion, and with it the wrench, is not.'
     not_corrected = 'An estimate is not corrected for amplifier_lag.'
     wrong = 'Without them an estimate is wrong by up to ΔX 1 µm, θ 2 µrad.'
 
     def description_of(*effects: NamedEffect, moves: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
-        return dataclasses.replace(found, effects=effects, moves=moves).sentences()[-1]
+        return dataclasses.replace(study, effects=effects, moves=moves).sentences()[-1]
 
     assert description_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
     assert description_of(lag) == not_corrected
@@ -658,7 +658,7 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery
     assert description_of(rotated, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
 
 
-def test_wrong_notes_that_do_the_same_are_named(found: Discovery) -> None:
+def test_wrong_notes_that_do_the_same_are_named(study: Discovery) -> None:
     soft, twists = (named_as(f'{way}_stiffness', scale=-0.2, moves_frequency=0.0) for way in ('bending', 'torsional'))
     same = 'times the noted ones would do the same: check'
     for effects, words in (
@@ -666,29 +666,29 @@ def test_wrong_notes_that_do_the_same_are_named(found: Discovery) -> None:
         ([twists], f'Torques 1.25 {same} the arm.'),
         ([soft, twists], f'Forces 1.25 times the noted ones and torques 1.25 {same} the scale and the arm.'),
         ([named_as('bending_stiffness', scale=-0.2, moves_frequency=1.0)], ''),
-        ([soft, found.effects[0]], ''),
+        ([soft, study.effects[0]], ''),
     ):
-        sentences = dataclasses.replace(found, effects=tuple(effects)).sentences()
+        sentences = dataclasses.replace(study, effects=tuple(effects)).sentences()
         assert [s for s in sentences if same in s] == ([words] if words else [])
 
 
-def test_places_are_reported_if_one_in_twenty_by_chance(found: Discovery) -> None:
-    first = found.where.cells[0]
+def test_places_are_reported_if_one_in_twenty_by_chance(study: Discovery) -> None:
+    first = study.where.cells[0]
     cells = tuple(dataclasses.replace(first, p=p) for p in (0.0, 0.0499, 0.05, 1.0))
-    changed = dataclasses.replace(found, where=dataclasses.replace(found.where, cells=cells))
+    changed = dataclasses.replace(study, where=dataclasses.replace(study.where, cells=cells))
     assert [place['p'] for place in changed.tree()['where']] == [0.0, 0.0499]
-    assert found.tree()['moves'] == dict(zip(('dx_m', 'dy_m', 'theta_rad'), found.moves, strict=True))
+    assert study.tree()['moves'] == dict(zip(('dx_m', 'dy_m', 'theta_rad'), study.moves, strict=True))
 
 
-def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
+def test_the_law_is_written_with_the_first_unknown(study: Discovery) -> None:
     law = Law('law_y2', 'psd', 'y2', (LawTerm('product', ('load_fx',), 1e-6),))
     other = Law('law_beam_y2', 'optics', 'beam_y2', law.terms)
     further = Law('law_x1', 'psd', 'x1', law.terms)
     of_law = FoundLaw(
         law,
         (further,),
-        dataclasses.replace(found.fit, effects=found.fit.effects * 3),
-        found.fit,
+        dataclasses.replace(study.fit, effects=study.fit.effects * 3),
+        study.fit,
         ('y2',),
         (other,),
         1e-9,
@@ -697,7 +697,7 @@ def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
         3e-7,
     )
     unknown = (Unknown('first', ('load_fx',), 0.75, rms=2e-6), Unknown('second', (), 0.5))
-    first, second = dataclasses.replace(found, unknown=unknown, law=of_law).tree()['unknown']
+    first, second = dataclasses.replace(study, unknown=unknown, law=of_law).tree()['unknown']
     assert second == {'signature': 'second', 'depends_on': [], 'explains': 0.5, 'rms': 0.0, 'law': None}
     written = first.pop('law')
     assert first == {'signature': 'first', 'depends_on': ['load_fx'], 'explains': 0.75, 'rms': 2e-6}
@@ -710,77 +710,77 @@ def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
         'expression': law.expression,
         'further': [further.expression],
         'heldout_after': 3e-7,
-        'beside': [a.label for a in found.fit.effects],
+        'beside': [a.label for a in study.fit.effects],
         'equivalent': [
             {'stage': 'optics', 'acts_on': 'beam_y2', 'variables': ['load_fx'], 'expression': other.expression}
         ],
         'evidence': {'delta_bic': 30.0, 'p': 1e-9, 'heldout_gain': 9.0, 'heldout_gain_error': 2.0},
     }
-    assert dataclasses.replace(found, unknown=unknown).tree()['unknown'][0]['law'] is None
+    assert dataclasses.replace(study, unknown=unknown).tree()['unknown'][0]['law'] is None
 
 
-def test_other_answers_have_other_sentences(found: Discovery) -> None:
-    (named,) = found.effects
-    floor = f'{1e6 * found.gap_floor:.3f} µm'
-    left = f'{1e6 * found.gap_after:.3f} µm, {found.floors:.2f} times the noise floor ({floor})'
-    before = f'{1e6 * found.gap_before:.3f}'
+def test_other_answers_have_other_sentences(study: Discovery) -> None:
+    (named,) = study.effects
+    floor = f'{1e6 * study.gap_floor:.3f} µm'
+    after = f'{1e6 * study.gap_after:.3f} µm, {study.floors:.2f} times the noise floor ({floor})'
+    before = f'{1e6 * study.gap_before:.3f}'
 
     def sentence(**given: Any) -> str:
         """Without what the effects do to an estimate."""
-        return dataclasses.replace(found, **given).sentence.partition(' Without ')[0]
+        return dataclasses.replace(study, **given).sentence.partition(' Without ')[0]
 
-    assert sentence(verdict='nothing_missing', effects=()) == f'Nothing is missing: the gap is {left}.'
+    assert sentence(verdict='nothing_missing', effects=()) == f'Nothing is missing: the gap is {after}.'
     # Without a stated noise nothing says that nothing is missing.
-    remains = f'{1e6 * found.gap_after:.3f} µm remains and follows nothing, as noise does.'
+    remains = f'{1e6 * study.gap_after:.3f} µm remains and follows nothing, as noise does.'
     without = sentence(verdict='nothing_missing', effects=(), gap_floor=math.inf)
     message = 'Nothing is missing as far as these readings show'
     assert without == f'{message}: {remains} How exact the readings are is not stated.'
     assert sentence(verdict='unknown_effect', effects=(), unknown=(Unknown('', (), 1.0),)) == (
-        f'An effect that is not in the catalogue: the gap is {left}.'
+        f'An effect that is not in the catalogue: the gap is {after}.'
     )
     assert sentence(verdict='unknown_effect', unknown=(Unknown('', (), 0.5),)) == (
         'sensor_rotation (psd 2) explains part, but an unknown effect remains: '
-        f'the gap goes from {before} µm to {left}. Fitted: sensor_rotation {trees.size_of(named)}.'
+        f'the gap goes from {before} µm to {after}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
     two = (named, dataclasses.replace(named, equivalent=('a', 'b'), sd={}))
     description_of_two = sentence(effects=two)
     assert description_of_two.startswith(
         'sensor_rotation (psd 2) and sensor_rotation (psd 2) (or a, b: this data cannot tell) are missing from the '
-        f'model; adding them closes the gap from {before} to {left}.'
+        f'model; adding them closes the gap from {before} to {after}.'
     )
     assert description_of_two.count('Fitted') == 1
     assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, unexplained=False),)).endswith(
-        f' close the gap from {before} to {left}, but their sizes are tied: '
+        f' close the gap from {before} to {after}, but their sizes are tied: '
         'one effect that is not in the catalogue is likelier.'
     )
     setup = (Finding('channel_sign', 'y1', -1.0, 'x'), Finding('channel_sign', 'y1', -1.0, 'y'))
     assert sentence(verdict='nothing_missing', effects=(), setup=setup) == (
         'The set-up is not as the rig file or the recording says: channel sign (y1). '
-        f'Nothing is missing besides: the gap is {left}.'
+        f'Nothing is missing besides: the gap is {after}.'
     )
     by_hand = Finding('load_time', 'load 1', -0.099, 'note it')
     assert (
-        sentence(verdict='nothing_missing', effects=(), setup=(by_hand,)) == f'Nothing is missing: the gap is {left}.'
+        sentence(verdict='nothing_missing', effects=(), setup=(by_hand,)) == f'Nothing is missing: the gap is {after}.'
     )
     late = Finding('load_delay', 'load_fx load_fy load_tz', 0.4, 'subtract')
     assert sentence(setup=(late,)) == (
         'The set-up is not as the rig file or the recording says: load delay (0.4 s late). '
         'sensor_rotation (psd 2) is missing from the model besides; adding it and putting the set-up right together '
-        f'close the gap from {before} to {left}. Fitted: sensor_rotation {trees.size_of(named)}.'
+        f'close the gap from {before} to {after}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
     unannotated = Finding('load_coverage', late.where, 0.5, 'note it')
     partly = {'verdict': 'unknown_effect', 'unknown': (Unknown('', (), 0.5),)}
     described = sentence(setup=(unannotated,), **partly)
     assert 'says: load coverage. sensor_rotation (psd 2) and the set-up put right explain part, but' in described
-    assert dataclasses.replace(found, setup=(unannotated,)).lines()[1] == 'set-up: load_coverage: note it'
-    tree = dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)).tree()
+    assert dataclasses.replace(study, setup=(unannotated,)).lines()[1] == 'set-up: load_coverage: note it'
+    tree = dataclasses.replace(study, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)).tree()
     assert tree['unknown'] == [{'signature': 's', 'depends_on': ['d'], 'explains': 0.4, 'rms': 2e-6, 'law': None}]
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
-    alternative = Alternative(named.active, {'angle': 1e-3}, 4.0, found.fit)
+    alternative = Alternative(named.active, {'angle': 1e-3}, 4.0, study.fit)
     listed_alternatives = dataclasses.replace(
-        found, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),)
+        study, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),)
     ).tree()
     assert listed_alternatives['effects'][0]['rivals'] == [
         {

@@ -48,34 +48,34 @@ OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0
 
 @pytest.mark.slow
 def test_link_effect_blames_no_detector_or_estimate() -> None:
-    found = searched(read(HELD, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HELD)
-    (effect,) = found.effects
+    discovery = searched(read(HELD, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HELD)
+    (effect,) = discovery.effects
     assert effect.active.effect.stage == 'link'
     assert not any('sensor' in name or 'gain' in name for name in effect.equivalent)
-    assert found.moves == (0.0, 0.0, 0.0)
-    assert 'The estimates of the pose are right without' in found.sentence
-    assert 'is wrong by up to' not in found.sentence
+    assert discovery.moves == (0.0, 0.0, 0.0)
+    assert 'The estimates of the pose are right without' in discovery.sentence
+    assert 'is wrong by up to' not in discovery.sentence
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.0, 0.97)])
 def test_other_natural_frequencies_are_rig_file_lines(bending: float, torsion: float) -> None:
     true = {'dynamics__bending_frequency': 14.0 * bending, 'dynamics__torsion_frequency': 21.0 * torsion}
-    found = searched(read(HELD, **true), HELD)
+    discovery = searched(read(HELD, **true), HELD)
     wrong = {key: f for key, f in (('bending', bending), ('torsion', torsion)) if f != 1.0}
-    assert [e.name for e in found.effects] == [f'{key}_frequency' for key in wrong]
-    assert [e.values['error'] for e in found.effects] == pytest.approx([f - 1.0 for f in wrong.values()], abs=1e-5)
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.05
-    assert found.setup == ()
+    assert [e.name for e in discovery.effects] == [f'{key}_frequency' for key in wrong]
+    assert [e.values['error'] for e in discovery.effects] == pytest.approx([f - 1.0 for f in wrong.values()], abs=1e-5)
+    assert discovery.verdict == 'effects_found'
+    assert discovery.floors < 1.05
+    assert discovery.setup == ()
     corrected = {f'dynamics.{key}_frequency': (14.0 if key == 'bending' else 21.0) * f for key, f in wrong.items()}
-    assert found.values == pytest.approx(corrected, rel=1e-5)
-    lines = [f'rig file: {key}: {found.values[key]}' for key in corrected]
-    assert [words for words in found.lines() if words.startswith('rig file')] == lines
-    again = flat_parameters(found.model_yaml(), Path('model.yaml'))
-    assert {key: again[key] for key in corrected} == found.values
+    assert discovery.values == pytest.approx(corrected, rel=1e-5)
+    lines = [f'rig file: {key}: {discovery.values[key]}' for key in corrected]
+    assert [words for words in discovery.lines() if words.startswith('rig file')] == lines
+    again = flat_parameters(discovery.model_yaml(), Path('model.yaml'))
+    assert {key: again[key] for key in corrected} == discovery.values
     assert not any(key.startswith('effects.') for key in again)
-    assert 'The estimates of the pose are right without' in found.sentence
+    assert 'The estimates of the pose are right without' in discovery.sentence
 
 
 @pytest.mark.slow
@@ -83,13 +83,13 @@ def test_other_natural_frequencies_are_rig_file_lines(bending: float, torsion: f
 def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
     annotated = np.vstack((np.zeros((late, 3)), HELD[:-late]))
-    found = searched(read(HELD, **{**ROTATED, 'effects__e__angle': angle}), annotated)
-    assert [f.name for f in found.setup] == ['load_delay']
-    assert found.setup[0].value == pytest.approx(1e-3 * late, abs=1e-5)
-    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
-    assert found.effects[0].active.values['angle'] == pytest.approx(angle, abs=2e-5)
-    assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
-    assert found.floors < 1.05
+    discovery = searched(read(HELD, **{**ROTATED, 'effects__e__angle': angle}), annotated)
+    assert [f.name for f in discovery.setup] == ['load_delay']
+    assert discovery.setup[0].value == pytest.approx(1e-3 * late, abs=1e-5)
+    assert [e.active.label for e in discovery.effects] == ['sensor_rotation (psd 1)']
+    assert discovery.effects[0].active.values['angle'] == pytest.approx(angle, abs=2e-5)
+    assert (discovery.verdict, discovery.unknown, discovery.law) == ('effects_found', (), None)
+    assert discovery.floors < 1.05
 
 
 def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
@@ -98,8 +98,8 @@ def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     comparison = cast(Workspace, SimpleNamespace(count=[np.ones((6, 1000))], split=lambda _: [table]))
     table[0, :5] = 1000.0
     table[2] = 1e6
-    beyond, throughout = excess(comparison, table)
-    assert beyond == pytest.approx(5e6 - 4000.0)
+    excess_chi2, throughout = excess(comparison, table)
+    assert excess_chi2 == pytest.approx(5e6 - 4000.0)
     assert throughout == pytest.approx(5 * 36.0 / 4000.0 - 1.0)
     table[[0, 1, 3, 4]] = 5.0
     assert excess(comparison, table) == pytest.approx((24.0 * 4000.0, 24.0))
@@ -185,13 +185,13 @@ def test_the_times_that_nobody_noted_are_free(began: bool, ended: bool) -> None:
     o = Observation('x', RIG, np.zeros((4000, 6)), np.zeros((4000, 3)))
     o.loads[1000:2500] = (3.0, -4.0, 2.0)
     ws = Workspace([o])
-    found = directions(ws, [Hold(0, 1000, 2500, 1, began, o.loads[1000], ended)])
-    assert [d.axis for d in found[:3]] == [0, 1, 2]
+    free = directions(ws, [Hold(0, 1000, 2500, 1, began, o.loads[1000], ended)])
+    assert [d.axis for d in free[:3]] == [0, 1, 2]
     applied = np.zeros((3, 4000, 3))
     applied[[0, 1, 2], 1000:2500, [0, 1, 2]] = 1.0
-    assert [np.sign(d.change).tolist() for d in found[:3]] == applied.tolist()
+    assert [np.sign(d.change).tolist() for d in free[:3]] == applied.tolist()
     wanted = [at for at, there in ((1000, began), (2500, ended)) if there]
-    assert [int(np.abs(d.change).sum(axis=1).argmax()) for d in found[3:]] == pytest.approx(wanted, abs=2)
+    assert [int(np.abs(d.change).sum(axis=1).argmax()) for d in free[3:]] == pytest.approx(wanted, abs=2)
 
 
 @pytest.mark.parametrize(('share', 'there'), [(1.1, True), (0.9, False)])
@@ -206,8 +206,8 @@ def test_a_detector_is_acquitted_by_what_it_would_show(
     def rotation(screen: Screen) -> list[Candidate]:
         return [c for c in screen.candidates if c.effect.name == 'sensor_rotation' and c.start['psd'] == 1]
 
-    (one,) = rotation(machine.screen(ws, None))
-    least = visible(ws, machine.bank.get(one, ws))
+    (candidate,) = rotation(machine.screen(ws, None))
+    least = visible(ws, machine.bank.get(candidate, ws))
     reading = cast(FourthReading, SimpleNamespace(acquits=True, allowed=3.0))
     machine = replace(machine, recorded=replace(machine.recorded, fourth=reading))
     monkeypatch.setattr(recorded_rig, 'excess', lambda ws, residual: (2.0 * 3.0 / (0.2 * share * least), 99.0))

@@ -73,11 +73,11 @@ def rotated() -> Discovery:
 
 @pytest.mark.slow
 def test_nothing_missing_is_the_answer_to_noise() -> None:
-    found = discover([observe(RIG, seed=7)], RIG, bank=BANK)
-    assert found.verdict == 'nothing_missing'
-    assert found.effects == ()
-    assert found.gap_after == pytest.approx(found.gap_floor, rel=0.05)
-    assert found.sentence.startswith('Nothing is missing')
+    discovery = discover([observe(RIG, seed=7)], RIG, bank=BANK)
+    assert discovery.verdict == 'nothing_missing'
+    assert discovery.effects == ()
+    assert discovery.gap_after == pytest.approx(discovery.gap_floor, rel=0.05)
+    assert discovery.sentence.startswith('Nothing is missing')
 
 
 @pytest.mark.slow
@@ -124,8 +124,8 @@ def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
 
 @pytest.mark.slow
 def test_what_one_load_shows_is_unknown_on_unseen_loads() -> None:
-    found = discover([observe(with_effect('amplifier_saturation', limit=8.48, sums=0))], RIG, bank=BANK)
-    assert (found.gap_heldout_after, found.gap_after) == pytest.approx((found.gap_before, found.gap_floor), rel=0.02)
+    study = discover([observe(with_effect('amplifier_saturation', limit=8.48, sums=0))], RIG, bank=BANK)
+    assert (study.gap_heldout_after, study.gap_after) == pytest.approx((study.gap_before, study.gap_floor), rel=0.02)
 
 
 @pytest.mark.slow
@@ -181,14 +181,14 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
 )
 def test_estimate_error_is_change_by_model_in_replay(effect: str, wrong: bool, tmp_path: Path) -> None:
     assert main(['simulate', '--out', str(tmp_path / 'a'), '--loads', 'thesis:1', '--effect', effect]) == 0
-    found = psd_deflection.discover([tmp_path / 'a'])
-    (tmp_path / 'model.yaml').write_text(found.model_yaml())
+    discovery = psd_deflection.discover([tmp_path / 'a'])
+    (tmp_path / 'model.yaml').write_text(discovery.model_yaml())
     without, corrected = (psd_deflection.replay(tmp_path / 'a', rig) for rig in (None, tmp_path / 'model.yaml'))
     changed = [float(np.abs(getattr(corrected, axis) - getattr(without, axis)).max()) for axis in ('dx', 'dy', 'theta')]
     # An estimate is of a moment; this is of the mean of a block, in which the link may swing.
-    assert found.moves == pytest.approx(changed, rel=0.2, abs=1e-12)
-    assert ('Without it an estimate is wrong by up to' in found.sentence) is wrong
-    assert ('An estimate is not corrected for amplifier_lag.' in found.sentence) is not wrong
+    assert discovery.moves == pytest.approx(changed, rel=0.2, abs=1e-12)
+    assert ('Without it an estimate is wrong by up to' in discovery.sentence) is wrong
+    assert ('An estimate is not corrected for amplifier_lag.' in discovery.sentence) is not wrong
 
 
 @pytest.mark.slow
@@ -200,8 +200,8 @@ def test_a_bag_reports_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsy
     assert main(['discover', str(tmp_path / 'run'), '--out', str(tmp_path / 'found'), '--quiet']) == 0
     assert 'sensor_rotation (psd 1) is missing' in capsys.readouterr().out
     assert load_rig(tmp_path / 'found' / 'model.yaml').link.length == 0.4
-    found = psd_deflection.discover([tmp_path / 'run'], tmp_path / 'found' / 'model.yaml')
-    assert found.verdict == 'nothing_missing'
+    discovery = psd_deflection.discover([tmp_path / 'run'], tmp_path / 'found' / 'model.yaml')
+    assert discovery.verdict == 'nothing_missing'
 
 
 @pytest.mark.slow
@@ -347,13 +347,13 @@ def test_law_with_large_held_out_gap_is_not_written(tmp_path: Path, monkeypatch:
     monkeypatch.setenv(FOLDERS, str(tmp_path))
     ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
     null = refit(ws, ())
-    found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
-    assert found is not None
+    law = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
+    assert law is not None
     nothing: dict[str, Any] = dict.fromkeys(f.name for f in dataclasses.fields(Discovery))
     without = Discovery(**{**nothing, 'gap_floor': ws.floor(), 'adopted': ''})
     assert without.adopt('none') is without
     for floors, written in ((1.9, True), (2.1, False)):
-        concluded = dataclasses.replace(without, law=dataclasses.replace(found, heldout_gap=floors * ws.floor()))
+        concluded = dataclasses.replace(without, law=dataclasses.replace(law, heldout_gap=floors * ws.floor()))
         assert (concluded.model_of_law is not None) == written
         assert concluded.adopt(name := f'odd{written}').adopted == name
         assert (tmp_path / f'{name}.yaml').exists() == written
@@ -406,8 +406,8 @@ def test_a_limit_that_is_not_reached_at_first_is_found() -> None:
 @pytest.mark.slow
 def test_the_covariance_of_the_sizes_is_that_of_least_squares() -> None:
     plant = Spring(0.3, k=1.05)
-    found = psd_deflection.discover_in(plant)
-    tree = found.tree()
+    discovery = psd_deflection.discover_in(plant)
+    tree = discovery.tree()
     names, matrix = tree['covariance']['names'], np.array(tree['covariance']['matrix'])
     terms = {'stiffness.scale': np.concatenate(plant.u), 'cubic.c': np.concatenate(plant.u) ** 3}
     assert sorted(names) == sorted(terms)
@@ -541,10 +541,10 @@ SET_UP_NEAR = (
 
 
 def found_in(*observations: Observation, full: bool = False) -> Discovery:
-    found = discover(observations, RIG, without=() if full else [n for n in effect_names() if n not in SET_UP_NEAR])
-    tree = found.tree()
+    discovery = discover(observations, RIG, without=() if full else [n for n in effect_names() if n not in SET_UP_NEAR])
+    tree = discovery.tree()
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
-    return found
+    return discovery
 
 
 @pytest.mark.slow
@@ -552,14 +552,14 @@ def found_in(*observations: Observation, full: bool = False) -> Discovery:
 def test_a_wrong_length_is_named_alone_and_beside_an_effect(beside: list[str]) -> None:
     """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
     true = with_effects(replace_values(RIG, {'link.length': 0.585 * 1.02}), beside, 'test')
-    found = found_in(observe(true, 3), full=True)
-    assert [effect.name for effect in found.effects] == [words.split(',')[0] for words in beside]
-    (mistake,) = found.setup
+    discovery = found_in(observe(true, 3), full=True)
+    assert [effect.name for effect in discovery.effects] == [words.split(',')[0] for words in beside]
+    (mistake,) = discovery.setup
     assert (mistake.name, mistake.where) == ('link_length', 'link.length')
     assert mistake.value == pytest.approx(1.02, abs=1e-4)
     assert mistake.fix.startswith('link.length: 0.596')
-    assert found.floors < 1.05
-    assert 'The set-up is not as' in found.sentence
+    assert discovery.floors < 1.05
+    assert 'The set-up is not as' in discovery.sentence
 
 
 @pytest.mark.slow
@@ -570,12 +570,12 @@ def test_a_psd_on_another_clock_is_named_late_or_early(psd: int, rows: int, besi
     volts = o.volts[max(rows, 0) :][:n].copy()
     volts[:, late] = o.volts[max(-rows, 0) :][:n, late]
     recorded = Observation('test', RIG, volts, o.loads[max(rows, 0) :][:n])
-    found = found_in(recorded)
-    (effect,) = found.effects
-    assert (effect.name, effect.values['psd'], found.setup) == ('channel_skew', psd, ())
+    discovery = found_in(recorded)
+    (effect,) = discovery.effects
+    assert (effect.name, effect.values['psd'], discovery.setup) == ('channel_skew', psd, ())
     assert effect.values['delay'] == pytest.approx(1e-3 * rows + beside, abs=4.0 * effect.sd['delay'])
-    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in found.lines()[1]
-    assert found.floors < 1.05
+    assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in discovery.lines()[1]
+    assert discovery.floors < 1.05
     with pytest.raises(RecordingError, match='the clocks are not alike'):
         found_in(recorded, o)
 

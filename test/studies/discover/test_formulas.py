@@ -86,8 +86,8 @@ def test_loads_move_the_dots_by_four_fifths_of_their_room(zero: float) -> None:
     f, t, arm = room / bends, room / (twists * reach), 0.2
     bar = room / (bends + arm * twists * reach)
     o, h = (0.0, 0.0, 0.0), (0.0, 0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25, 0.0)
-    turns = [(1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1), (1, 1, -1), (-1, -1, -1)]
-    corners = [(0.5 * f * a, 0.5 * f * b, 0.6 * t * c) for a, b, c in turns]
+    signs = [(1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1), (1, 1, -1), (-1, -1, -1)]
+    corners = [(0.5 * f * a, 0.5 * f * b, 0.6 * t * c) for a, b, c in signs]
     got = [p.script for p in pieces(rig, Limits(force=1e6, torque=1e6, sidebar=arm))]
     assert got[:7] == [
         script([o, (0, -f, 0), o, (0, f, 0), o, (f, 0, 0), o, (-f, 0, 0), o], 1.5),
@@ -194,7 +194,7 @@ def test_separation_is_residual_of_both_recordings() -> None:
 def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
     """By masks on the full spectrum (Parseval); the gain in a band counts if it is beyond what may be wrong there."""
     rng = np.random.default_rng(2)
-    one, other, explained = (rng.standard_normal(sum(m.size for m in workspace.measured)) for _ in range(3))
+    first, other, explained = (rng.standard_normal(sum(m.size for m in workspace.measured)) for _ in range(3))
     edges = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
 
     def bands(vector: FloatArray) -> FloatArray:
@@ -206,21 +206,21 @@ def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
                 out[r, :, b] = spectrum[:, (f >= low) & (f < high)].sum(axis=1)
         return out
 
-    np.testing.assert_allclose(energies(workspace, one), bands(one), rtol=1e-9, atol=1e-9)
-    assert energies(workspace, one).sum() == pytest.approx(float(one @ one))
+    np.testing.assert_allclose(energies(workspace, first), bands(first), rtol=1e-9, atol=1e-9)
+    assert energies(workspace, first).sum() == pytest.approx(float(first @ first))
     for size in (0.0, 1.0, 300.0, 3000.0):
-        gain = bands(one) - bands(other)
+        gain = bands(first) - bands(other)
         allowed = 0.002**2 * size**2 * bands(explained)
         want = sum(g for g, a in zip(gain.ravel(), allowed.ravel(), strict=True) if g < 0.0 or g > a)
-        assert gain_beyond(workspace, one, other, size * explained) == pytest.approx(want, rel=1e-6)
+        assert gain_beyond(workspace, first, other, size * explained) == pytest.approx(want, rel=1e-6)
 
 
 def test_folds_are_dealt_out_in_turn(workspace: Workspace) -> None:
     cases = max(int(c.max()) for c in workspace.case) + 1
     assert workspace.folds().tolist() == [i % 4 for i in range(cases)]
     assert workspace.case[1].min() == workspace.case[0].max() + 1
-    one = Workspace([make_observation(history=np.zeros((400, 3)), warm=None)])
-    assert one.folds().tolist() == [0, 1, 2, 3]
+    single = Workspace([make_observation(history=np.zeros((400, 3)), warm=None)])
+    assert single.folds().tolist() == [0, 1, 2, 3]
 
 
 def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:
@@ -329,9 +329,9 @@ def test_a_channel_is_stuck_from_three_hundredths_of_a_second_on(count: int, is_
     rng = np.random.default_rng(6)
     volts = rng.standard_normal((500, 2))
     volts[100 : 100 + count, 1] = 0.1
-    found = stuck(volts, 1e-3, np.full(2, 0.01), 1e-3)
-    assert not found[:, 0].any()
-    assert np.flatnonzero(found[:, 1]).tolist() == (list(range(100, 100 + count)) if is_stuck else [])
+    mask = stuck(volts, 1e-3, np.full(2, 0.01), 1e-3)
+    assert not mask[:, 0].any()
+    assert np.flatnonzero(mask[:, 1]).tolist() == (list(range(100, 100 + count)) if is_stuck else [])
     # At its highest and lowest it may be limited; a channel quieter than the converter's step may rest.
     for limit in (9.0, -9.0):
         high = volts.copy()
@@ -361,8 +361,8 @@ def test_what_is_known_of_a_recording_is_reported() -> None:
     assert np.flatnonzero(gone).tolist() == [*range(100), *range(1150, 1200)]
     assert cleaned.digest == reported.hashed()
     for unknown, gone_samples in (((100, 0), range(100)), ((0, 100), range(1100, 1200))):
-        half, (one,) = clean(dataclasses.replace(o, unknown_load=unknown), ())
-        assert one.value == pytest.approx(100 / 1200)
+        half, (finding,) = clean(dataclasses.replace(o, unknown_load=unknown), ())
+        assert finding.value == pytest.approx(100 / 1200)
         assert np.flatnonzero(np.isnan(half.volts).all(axis=1)).tolist() == list(gone_samples)
     # Up to a twentieth is left out and not told; and what is whole stays as it is.
     quiet, findings = clean(dataclasses.replace(o, unknown_load=(30, 30)), ())

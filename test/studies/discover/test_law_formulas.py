@@ -31,9 +31,9 @@ def observed() -> tuple[Workspace, Fit]:
     return workspace, refit(workspace, [make_active('sensor_rotation', {'psd': 2, 'angle': 0.0}, 'test')], 2)
 
 
-def term_names(found: list[LawTerm]) -> dict[tuple[str, tuple[str, ...]], list[dict[str, float]]]:
+def term_names(terms: list[LawTerm]) -> dict[tuple[str, tuple[str, ...]], list[dict[str, float]]]:
     out: dict[tuple[str, tuple[str, ...]], list[dict[str, float]]] = {}
-    for t in found:
+    for t in terms:
         out.setdefault((t.form, t.of), []).append(dict(t.shapes))
     return out
 
@@ -76,12 +76,12 @@ def test_a_gain_is_that_of_the_simulated_picture(observed: tuple[Workspace, Fit]
     q, _ = np.linalg.qr(fit.jacobian)
     across = picture - q @ (q.T @ picture)
     want = float(across @ fit.residual) ** 2 / float(across @ across)
-    found = responses(workspace, fit)
-    (got,) = score(found, [LawTerm('product', (of,))], (target,))
+    answers = responses(workspace, fit)
+    (got,) = score(answers, [LawTerm('product', (of,))], (target,))
     # A first-order answer: held over a fine block, and the optics at the middle of it.
     assert got.gain == pytest.approx(want, rel=0.1, abs=0.02)
     assert got.term.coefficient == pytest.approx(float(across @ fit.residual) / float(across @ across), rel=0.1)
-    assert score(found, [LawTerm('product', ('dx',))], ('static_dx', 'load_fx')) == []
+    assert score(answers, [LawTerm('product', ('dx',))], ('static_dx', 'load_fx')) == []
 
 
 def test_what_a_target_lacks_is_estimated_with_its_weight(observed: tuple[Workspace, Fit]) -> None:
@@ -123,12 +123,12 @@ def test_two_levels_are_separated_from_a_stated_gain_on() -> None:
     """A box of the height A and n blocks of weight w gains n w A^2 in chi-square, for two changes of 24."""
     rng = np.random.default_rng(2)
     n = 200
-    own = np.zeros(n)
-    own[60:110] = 2.0
-    own[150:170] = 2.0
+    pulses = np.zeros(n)
+    pulses[60:110] = 2.0
+    pulses[150:170] = 2.0
     v = rng.uniform(0.5, 2.0, n) * rng.choice((-1.0, 1.0), n)
     v[5] = 0.0
-    assert law_features.two_levels(own * v, np.full(n, 3.0), v) == [60, 110, 150, 170]
+    assert law_features.two_levels(pulses * v, np.full(n, 3.0), v) == [60, 110, 150, 170]
     ones = np.ones(n)
     box = np.zeros(n)
     box[60:110] = 1.0
@@ -161,13 +161,13 @@ def test_times_that_show_are_terms_and_become_better(observed: tuple[Workspace, 
             )
         ]
     )
-    found = responses(workspace, refit(workspace, ()))
-    first, *_ = switchings(found, ('y1',))
+    answers = responses(workspace, refit(workspace, ()))
+    first, *_ = switchings(answers, ('y1',))
     assert (first.form, first.of) == ('switched', ())
     assert first.times == pytest.approx((0.313, 0.871), abs=0.0011)
-    rough = law_features.with_better_times(found, 'y1', LawTerm('switched', (), times=(0.25, 0.95)))
+    rough = law_features.with_better_times(answers, 'y1', LawTerm('switched', (), times=(0.25, 0.95)))
     assert rough.times == pytest.approx((0.313, 0.871), abs=0.0011)
-    assert {t.of for t in switchings(found, ('y1',))} <= {(), ('x1',), ('y1',)}
+    assert {t.of for t in switchings(answers, ('y1',))} <= {(), ('x1',), ('y1',)}
 
 
 @pytest.mark.parametrize('form', ['over', 'under'])
@@ -176,27 +176,27 @@ def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
     level = float(np.quantile(ringing[np.abs(ringing) > 1e-6], 0.6))
     law = Law('bump', 'psd', 'x1', (LawTerm(form, ('y1',), 3e-5, {'threshold': level}),))
     workspace = Workspace([make_observation(4, (ActiveEffect(effect_of(law), values_of(law)),))])
-    found = responses(workspace, refit(workspace, ()))
+    answers = responses(workspace, refit(workspace, ()))
     pitch = float(np.ptp(ringing)) / 24
     for start in (level - 0.9 * pitch, level + 0.9 * pitch):
-        rough = score(found, [LawTerm(form, ('y1',), shapes={'threshold': start})], ('x1',))[0]
-        better = law_features.with_better_level(found, rough)
+        rough = score(answers, [LawTerm(form, ('y1',), shapes={'threshold': start})], ('x1',))[0]
+        better = law_features.with_better_level(answers, rough)
         assert better.gain > rough.gain
         assert better.term.shapes['threshold'] == pytest.approx(level, abs=0.04 * pitch)
         assert better.term.coefficient == pytest.approx(3e-5, rel=0.02)
         assert 0.0 < better.term.sd['threshold'] < 0.04 * pitch
-    kept = score(found, [LawTerm('above', ('y1',), shapes={'threshold': level})], ('x1',))[0]
-    assert law_features.with_better_level(found, kept) is kept
+    exact = score(answers, [LawTerm('above', ('y1',), shapes={'threshold': level})], ('x1',))[0]
+    assert law_features.with_better_level(answers, exact) is exact
 
 
 def test_between_two_loads_any_level_is_as_good(observed: tuple[Workspace, Fit]) -> None:
     """Its middle is told, and the width of what is between, as a standard deviation; the fit keeps both."""
     workspace, fit = observed
-    found = responses(workspace, fit)
-    levels = np.unique(found[0].known['load_fx'])
+    answers = responses(workspace, fit)
+    levels = np.unique(answers[0].known['load_fx'])
     low, high = levels[-2:].tolist()
-    start = score(found, [LawTerm('over', ('load_fx',), shapes={'threshold': low + 0.1 * (high - low)})], ('x2',))[0]
-    better = law_features.with_better_level(found, start)
+    start = score(answers, [LawTerm('over', ('load_fx',), shapes={'threshold': low + 0.1 * (high - low)})], ('x2',))[0]
+    better = law_features.with_better_level(answers, start)
     assert better.gain == pytest.approx(start.gain)
     assert better.term.shapes['threshold'] == pytest.approx(0.5 * (low + high))
     assert better.term.sd['threshold'] == pytest.approx((high - low) / math.sqrt(12.0))
@@ -263,32 +263,32 @@ def trial(law: Law, cost: float, chi2: float, *beside: ActiveEffect) -> laws.Law
 
 def test_of_laws_that_cannot_be_separated_the_simplest_is_taken() -> None:
     two = trial(Law('a', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fy')),)), 10.0, 5.0)
-    one = Law('b', 'psd', 'y2', (LawTerm('product', ('x2',)),))
-    assert laws.simplest(two, [trial(one, 19.9, 26.5)]).laws == (one,)
-    assert laws.simplest(two, [trial(one, 20.1, 6.0)]) is two
-    assert laws.simplest(two, [trial(one, 11.0, 26.7)]) is two
+    simple = Law('b', 'psd', 'y2', (LawTerm('product', ('x2',)),))
+    assert laws.simplest(two, [trial(simple, 19.9, 26.5)]).laws == (simple,)
+    assert laws.simplest(two, [trial(simple, 20.1, 6.0)]) is two
+    assert laws.simplest(two, [trial(simple, 11.0, 26.7)]) is two
     # Beside other effects it is another answer; a dot goes before the pose; of equals the cheaper.
-    assert laws.simplest(two, [trial(one, 11.0, 6.0, make_active('creep', {'amplitude': 0.1}, 'test'))]) is two
+    assert laws.simplest(two, [trial(simple, 11.0, 6.0, make_active('creep', {'amplitude': 0.1}, 'test'))]) is two
     of_pose = trial(Law('c', 'psd', 'y2', (LawTerm('product', ('dx',)),)), 5.0, 5.0)
-    assert laws.simplest(of_pose, [trial(one, 6.0, 5.0)]).laws == (one,)
+    assert laws.simplest(of_pose, [trial(simple, 6.0, 5.0)]).laws == (simple,)
     on_link = trial(Law('c', 'link', 'theta', (LawTerm('product', ('dx',)),)), 5.0, 5.0)
-    assert laws.simplest(on_link, [trial(one, 6.0, 5.0)]) is on_link
-    assert laws.simplest(trial(one, 6.0, 5.0), [on_link]) == on_link
+    assert laws.simplest(on_link, [trial(simple, 6.0, 5.0)]) is on_link
+    assert laws.simplest(trial(simple, 6.0, 5.0), [on_link]) == on_link
 
 
 def test_laws_that_the_recording_cannot_exclude_are_listed_once() -> None:
     best = Law('a', 'psd', 'y2', (LawTerm('product', ('load_fx',)),))
     beam, link = dataclasses.replace(best, stage='optics', acts_on='beam_y2'), Law('b', 'link', 'dy', best.terms)
-    far, dear = dataclasses.replace(link, acts_on='dx'), dataclasses.replace(link, acts_on='theta')
-    others = [
+    of_dx, of_theta = dataclasses.replace(link, acts_on='dx'), dataclasses.replace(link, acts_on='theta')
+    trials = [
         trial(link, 31.5, 26.5),
         trial(beam, 12.0, 6.0),
         trial(dataclasses.replace(beam, name='again'), 14.0, 6.0),
-        trial(far, 11.0, 26.7),
-        trial(dear, 31.7, 5.0),
+        trial(of_dx, 11.0, 26.7),
+        trial(of_theta, 31.7, 5.0),
         trial(best, 10.0, 5.0),
     ]
-    assert laws.tied_laws(trial(best, 10.0, 5.0), others) == (beam, link)
+    assert laws.tied_laws(trial(best, 10.0, 5.0), trials) == (beam, link)
 
 
 def test_variances_are_the_likeliest() -> None:
@@ -320,10 +320,10 @@ def test_noise_growing_with_load_has_size_and_evidence() -> None:
     volts[:, 4] += 4e-3 * (o.loads[:, 1] / full) * rng.standard_normal(len(volts))
     workspace = Workspace([dataclasses.replace(o, volts=volts)])
     fit = refit(workspace, ())
-    found = laws.find_jitter(workspace, fit, 3.0)
-    assert found is not None
-    (term,) = found.law.terms
-    assert (found.law.acts_on, found.law.stage, term.form, found.channels) == ('y2', 'electronics', 'jitter', ('y2',))
+    trial = laws.find_jitter(workspace, fit, 3.0)
+    assert trial is not None
+    (term,) = trial.law.terms
+    assert (trial.law.acts_on, trial.law.stage, term.form, trial.channels) == ('y2', 'electronics', 'jitter', ('y2',))
     assert term.of in (('load_fy',), ('y1',), ('y2',), ('dy',))
     squares = workspace.split(fit.residual)[0][4] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
@@ -331,32 +331,32 @@ def test_noise_growing_with_load_has_size_and_evidence() -> None:
     gain = law_features.likelihood(squares, a + b * known**2 / (known**2).max()) - law_features.likelihood(
         squares, squares.mean()
     )
-    assert found.delta_bic == pytest.approx(gain - 3.0, rel=1e-9)
+    assert trial.delta_bic == pytest.approx(gain - 3.0, rel=1e-9)
     # Of block means: what is added to one sample, by the square root of four samples in a fine block.
     scale = workspace.noise[0].innovation[4] * math.sqrt(4.0) * float(RIG.sensitivities.ravel()[3])
     assert term.coefficient == pytest.approx(math.sqrt(b / (known**2).max()) * scale, rel=1e-9)
     assert term.sd == pytest.approx({'coefficient': term.coefficient / math.sqrt(gain)})
-    assert found.heldout.error == pytest.approx(math.sqrt(gain))
+    assert trial.heldout.error == pytest.approx(math.sqrt(gain))
     # Each fold of load cases with the variances of the others.
     fold = np.concatenate([workspace.folds()[case] for case in workspace.case])
     v2, want = known**2 / (known**2).max(), 0.0
     for k in set(fold.tolist()):
         a, b = law_features.variance(squares[fold != k], v2[fold != k])
-        own = squares[fold == k]
-        want += law_features.likelihood(own, a + b * v2[fold == k]) - law_features.likelihood(
-            own, squares[fold != k].mean()
+        held_out = squares[fold == k]
+        want += law_features.likelihood(held_out, a + b * v2[fold == k]) - law_features.likelihood(
+            held_out, squares[fold != k].mean()
         )
-    assert found.heldout.gain == pytest.approx(0.5 * want, rel=1e-9)
-    assert found.laws == (found.law,)
-    assert [law.stage for law in found.equivalent] == ['psd']
-    assert found.adopted('mine') == dataclasses.replace(found.law, name='mine')
+    assert trial.heldout.gain == pytest.approx(0.5 * want, rel=1e-9)
+    assert trial.laws == (trial.law,)
+    assert [law.stage for law in trial.equivalent] == ['psd']
+    assert trial.adopted('mine') == dataclasses.replace(trial.law, name='mine')
     # One cause on two quantities is one law.
-    other = dataclasses.replace(found.law, acts_on='x1')
-    twice = dataclasses.replace(found, further=(other,))
-    assert twice.adopted('mine') == dataclasses.replace(found.law, name='mine', further=(other,))
-    assert found.beside == ()
+    other = dataclasses.replace(trial.law, acts_on='x1')
+    twice = dataclasses.replace(trial, further=(other,))
+    assert twice.adopted('mine') == dataclasses.replace(trial.law, name='mine', further=(other,))
+    assert trial.beside == ()
     added = float(np.mean((term.coefficient * known) ** 2)) / 4.0 / 20.0
-    assert found.heldout_gap == pytest.approx(math.sqrt(max(heldout_gap(workspace, fit) ** 2 - added, 0.0)), rel=1e-9)
+    assert trial.heldout_gap == pytest.approx(math.sqrt(max(heldout_gap(workspace, fit) ** 2 - added, 0.0)), rel=1e-9)
     assert laws.find_jitter(workspace, fit, gain) is None
     # Of a gap beyond the noise it explains half, or is no law; noise alone may leave 1.1 floors.
     half, more = Workspace([dataclasses.replace(o, volts=0.5 * (o.volts + volts))]), added / workspace.floor() ** 2
@@ -395,12 +395,12 @@ class Given(laws.LawSearch):
         self.start = cast(Fit, SimpleNamespace(effects=()))
         self.penalty, self.last, self.responses, self.listed = 3.0, 600, [], []
 
-    def trial(self, found: Any, beside: Any, iterations: int) -> laws.LawTrial:
-        key = ' '.join(v for law in found for t in law.terms for v in t.of), ' '.join(a.effect.name for a in beside)
+    def trial(self, tried: Any, beside: Any, iterations: int) -> laws.LawTrial:
+        key = ' '.join(v for law in tried for t in law.terms for v in t.of), ' '.join(a.effect.name for a in beside)
         self.asked.append((*key, iterations))
-        effects = (*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in found))
+        effects = (*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in tried))
         fit = cast(Fit, SimpleNamespace(chi2=self.chi2, effects=effects, parameters=1))
-        return laws.LawTrial(tuple(found), fit, self.costs.get(key, 1000.0))
+        return laws.LawTrial(tuple(tried), fit, self.costs.get(key, 1000.0))
 
 
 def law_of(*variables: str, on: str = 'y2') -> Law:
@@ -411,13 +411,13 @@ BESIDE = (make_active('creep', {'amplitude': 0.1}, 't'), make_active('sensor_gai
 
 
 @pytest.mark.parametrize(
-    ('more', 'left'), [(9.9, ('sensor_gain',)), (10.0, ('sensor_gain',)), (10.1, ('creep', 'sensor_gain'))]
+    ('more', 'remaining'), [(9.9, ('sensor_gain',)), (10.0, ('sensor_gain',)), (10.1, ('creep', 'sensor_gain'))]
 )
-def test_an_effect_that_stood_in_for_the_law_goes(more: float, left: tuple[str, ...]) -> None:
+def test_an_effect_that_stood_in_for_the_law_goes(more: float, remaining: tuple[str, ...]) -> None:
     """If that costs no more than an effect must gain."""
     seeker = Given({('dx', 'creep sensor_gain'): 50.0, ('dx', 'sensor_gain'): 50.0 + more, ('dx', 'creep'): 90.0})
     got = seeker.lean(seeker.trial([law_of('dx')], BESIDE, 1))
-    assert tuple(a.effect.name for a in got.beside) == left
+    assert tuple(a.effect.name for a in got.beside) == remaining
 
 
 @pytest.mark.parametrize(('without', 'terms_left'), [(109.9, 'dx'), (110.0, 'dx'), (110.1, 'dx dy')])

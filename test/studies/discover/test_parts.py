@@ -147,9 +147,9 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
     np.testing.assert_allclose(second, 1.2 + 0.02 + 0.04 * np.arange(40))
     np.testing.assert_allclose(beside['load_fy / N'][0], gappy.observations[0].loads[:, 1].reshape(60, 20).mean(axis=1))
     np.testing.assert_array_equal(beside['y2 / mm'][1], 1e3 * dots[1][3])
-    (one, two) = gappy.provenance()
-    assert (one['name'], one['seconds'], two['seconds']) == ('seen', pytest.approx(1.2), pytest.approx(1.602))
-    assert one['rest_seconds'] == gappy.noise[0].rest_seconds
+    (entry, two) = gappy.provenance()
+    assert (entry['name'], entry['seconds'], two['seconds']) == ('seen', pytest.approx(1.2), pytest.approx(1.602))
+    assert entry['rest_seconds'] == gappy.noise[0].rest_seconds
     lost = dataclasses.replace(gappy.observations[0], volts=np.full((1200, 6), np.nan))
     assert Workspace([lost]).gap(Workspace([lost]).measured) == 0.0
 
@@ -173,7 +173,7 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     changes[0, 300:700, 1] = changes[1, 500:, 0] = 1.0
     changes[1, 500:, 1] = 0.7
     free = tuple(LoadDirection(0, changes[k], float(sd[k]), 'hung', k) for k in range(2))
-    own = ws.with_free(free)
+    wider = ws.with_free(free)
 
     def shown(loads: FloatArray) -> list[FloatArray]:
         return [fine_means(ForwardModel(o.rig).expect(loads, o.temperature).volts, 4)]
@@ -182,26 +182,26 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     a = np.stack([ws.whiten([moved - still for moved in shown(o.loads + c)]) for c in changes], axis=1)
     inverse = np.linalg.inv(a.T @ a + np.diag(1.0 / sd**2))
     rng = np.random.default_rng(0)
-    one, other = (o.rig.noises.ravel()[:, None] * rng.standard_normal(still.shape) for _ in range(2))
-    r, s = ws.whiten([one]), ws.whiten([other])
-    assert own.whiten([one]) @ own.whiten([other]) == pytest.approx(r @ s - (a.T @ r) @ inverse @ (a.T @ s), rel=1e-6)
-    want = np.sqrt(np.diag(inverse))
-    assert own.direction_sd() == pytest.approx({(id(free[0].of), k): v for k, v in enumerate(want.tolist())}, rel=1e-6)
+    p, q = (o.rig.noises.ravel()[:, None] * rng.standard_normal(still.shape) for _ in range(2))
+    r, s = ws.whiten([p]), ws.whiten([q])
+    assert wider.whiten([p]) @ wider.whiten([q]) == pytest.approx(r @ s - (a.T @ r) @ inverse @ (a.T @ s), rel=1e-6)
+    sds = np.sqrt(np.diag(inverse))
+    assert wider.direction_sd() == pytest.approx({(id(free[0].of), k): v for k, v in enumerate(sds.tolist())}, rel=1e-6)
     # Beside what another 3 N and 1 N leave, and only then is it worth a simulation more.
-    off = [one + moved - still for moved in shown(o.loads + 3.0 * changes[0] - changes[1])]
+    off = [p + moved - still for moved in shown(o.loads + 3.0 * changes[0] - changes[1])]
     sizes = inverse @ a.T @ ws.whiten(off)
     loads = o.loads + np.tensordot(sizes, changes, 1)
-    for again in (own.refitted(off), own.refitted_beside(off, ())):
+    for again in (wider.refitted(off), wider.refitted_beside(off, ())):
         np.testing.assert_allclose(again.observations[0].loads, loads, atol=1e-6)
         assert len(again.directions) == 2
-    assert own.refitted_beside([np.zeros_like(one)], ()) is own
+    assert wider.refitted_beside([np.zeros_like(p)], ()) is wider
     assert (ws.direction_sd(), ws.refitted(off), ws.refitted_beside(off, ())) == ({}, ws, ws)
     assert ws.with_free((ZeroDirection(0, 1, 1e-6),)).refitted_beside(off, ()).observations[0] is o
     # Five, of which two make the others: of least norm.
     sums = np.array([[1.0, 0.0], [0.7, 0.0], [0.0, 1.0], [1.0, 1.0], [-0.7, 1.0]])
     five = [LoadDirection(0, np.tensordot(s, changes, 1), 1e4, 'hung', k) for k, s in enumerate(sums)]
-    got, want = ws.with_free(five).direction_sd(), np.linalg.norm(np.linalg.pinv(a @ sums.T, rcond=1e-9), axis=1)
-    assert list(got.values()) == pytest.approx(want.tolist(), rel=1e-6)
+    got, sds = ws.with_free(five).direction_sd(), np.linalg.norm(np.linalg.pinv(a @ sums.T, rcond=1e-9), axis=1)
+    assert list(got.values()) == pytest.approx(sds.tolist(), rel=1e-6)
 
 
 def resting(n: int, level: float, memory: float = 0.0, seed: int = 0) -> FloatArray:
@@ -228,11 +228,11 @@ def test_a_weak_memory_counts_beside_clear_ones(errors: tuple[float, ...], colou
         def mixed(share: float, x: FloatArray = white) -> FloatArray:
             return x + share * np.roll(x, 1)
 
-        def beyond(share: float, wanted: float = wanted) -> float:
+        def excess(share: float, wanted: float = wanted) -> float:
             x = mixed(share)
             return float(x[1:] @ x[:-1] / (x @ x) * math.sqrt(n)) - wanted
 
-        rows[:, c] = mixed(brentq(beyond, -0.5, 0.5))
+        rows[:, c] = mixed(brentq(excess, -0.5, 0.5))
     o = Observation('x', RIG, np.zeros((n, 6)), np.zeros((n, 3)))
     model = estimate_noise(o, 1e-3 * rows, 4, np.full(6, 1e-6))
     assert model.coloured == (True,) * coloured + (False,) * (6 - coloured)
@@ -280,8 +280,8 @@ def test_wild_values_count_as_six_deviations() -> None:
     """Their energy is that of a flat spectrum, 36, of which each band has its part; nothing else is there."""
     residual = np.zeros((6, FINE))
     residual[0, 10] = 60.0
-    found = localise.localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(0), limit=6)
-    for cell in found.cells:
+    located = localise.localise(Plant({}, noise()), residual.ravel(), None, np.random.default_rng(0), limit=6)
+    for cell in located.cells:
         low, high = cell.band
         f = np.abs(np.fft.fftfreq(50, 0.004))
         dof = int(((f >= low) & (f < (high if high < 125.0 else math.inf))).sum())
@@ -297,8 +297,8 @@ STEPS = (steps.search, steps.weigh, steps.alternatives, steps.where)
 class Library(Lone):
     """A lone machine whose library are the plant's pictures; mistakes are looked for only if the comparison says so."""
 
-    def __init__(self, plant: Plant, left: Localisation = NOWHERE) -> None:
-        super().__init__(plant, left)
+    def __init__(self, plant: Plant, residual: Localisation = NOWHERE) -> None:
+        super().__init__(plant, residual)
         self.shown: Mapping[tuple[str, str], FloatArray] = plant.pictures
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
@@ -329,9 +329,9 @@ def test_step_adds_results_and_changes_no_earlier_ones() -> None:
     assert first.comparison is plant
     observed = [first]
     for step in STEPS:
-        kept = {f.name: getattr(observed[-1], f.name) for f in dataclasses.fields(Problem)}
+        earlier = {f.name: getattr(observed[-1], f.name) for f in dataclasses.fields(Problem)}
         observed.append(step(observed[-1]))
-        assert all(getattr(observed[-2], name) is value for name, value in kept.items())
+        assert all(getattr(observed[-2], name) is value for name, value in earlier.items())
     assert first.comparison is plant
     _, searched, weighed, named, last = observed
     assert names(searched.fit) == names(searched.result.fit) == ['a', 'b']
@@ -373,17 +373,17 @@ def test_unexplained_remainder_drops_weak_effects() -> None:
     plant = Plant(shown, without_noise((shown[A], 200.0)) + noise())
     # Faster than blocks, so that no gap has it.
     fast = Cell('x1', 0, (0.0, 1.0), (25.0, 60.0), (), 9.0, 0.0, 900.0)
-    left = nowhere(p=0.0, excess=900.0, cells=(fast,))
-    last = steps.solve(Library(plant, left), STEPS, 0, lambda _: None)
-    assert (steps.fields_of(last)['verdict'], names(last.fit), last.residual) == ('unknown_effect', [], left)
+    residual = nowhere(p=0.0, excess=900.0, cells=(fast,))
+    last = steps.solve(Library(plant, residual), STEPS, 0, lambda _: None)
+    assert (steps.fields_of(last)['verdict'], names(last.fit), last.residual) == ('unknown_effect', [], residual)
     assert last.search.trace[-1].endswith('explains less than what remains unknown')
     strong = Plant(shown, without_noise((shown[A], 2000.0)) + noise())
-    kept = steps.solve(Library(strong, left), STEPS, 0, lambda _: None)
-    assert (steps.fields_of(kept)['verdict'], names(kept.fit)) == ('unknown_effect', ['a'])
+    strong_last = steps.solve(Library(strong, residual), STEPS, 0, lambda _: None)
+    assert (steps.fields_of(strong_last)['verdict'], names(strong_last.fit)) == ('unknown_effect', ['a'])
 
 
-@pytest.mark.parametrize(('of_effect', 'found'), [(0.0, ['link_length']), (0.3, ['b', 'c'])])
-def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, found: Sequence[str]) -> None:
+@pytest.mark.parametrize(('of_effect', 'expected'), [(0.0, ['link_length']), (0.3, ['b', 'c'])])
+def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, expected: Sequence[str]) -> None:
     """Length and one effect explain as much as two effects do: then it is the effects."""
     length, b, c = ('link_length', 'x'), ('b', 'x'), ('c', 'x')
     shown = pictures(length, b, c)
@@ -396,7 +396,7 @@ def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, found: Se
     else:
         plant = Plant(shown, without_noise((shown[length], total)) + noise())
     after = steps.search(begun(Library(plant)))
-    assert names(after.fit) == found
+    assert names(after.fit) == expected
     assert after.comparison.first == (frozenset() if of_effect else FIRST)
     assert plant.first == FIRST
 
@@ -406,14 +406,14 @@ def test_others_are_refitted_without_removed_effect() -> None:
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     both = steps.weigh(steps.search(begun(Library(plant))))
     at = [a.effect.name for a in both.fit.effects].index('a')
-    one = steps.without_effect(both, at, 'is not wanted')
-    assert names(one.fit) == ['b']
-    assert one.heldout == (both.heldout[1 - at],)
-    assert len(one.result.delta_chi2) == 1
-    assert one.result.fit is both.fit
-    assert one.search.trace[-1] == 'a is not wanted'
-    none = steps.without_effect(one, 0, 'neither')
-    assert none.fit is one.result.null
+    reduced = steps.without_effect(both, at, 'is not wanted')
+    assert names(reduced.fit) == ['b']
+    assert reduced.heldout == (both.heldout[1 - at],)
+    assert len(reduced.result.delta_chi2) == 1
+    assert reduced.result.fit is both.fit
+    assert reduced.search.trace[-1] == 'a is not wanted'
+    none = steps.without_effect(reduced, 0, 'neither')
+    assert none.fit is reduced.result.null
 
 
 def test_gap_before_is_that_of_original_recording() -> None:
@@ -439,8 +439,8 @@ def test_what_is_coupled_to_nothing_is_none(main: float, coupled: float) -> None
     with_it = EffectParameter('with_it', '', -9.0, 9.0, 1.0, '', kind='coupled')
     effect = Effect('made_up', 'psd', '', '', '', '', (size, with_it), 'dots', apply=lambda *_: None)
     off = {'size': 0.0, 'with_it': 0.0}
-    found = Candidate(effect, off, ('size', 'with_it'), off).from_coefficients(np.array([main, 0.5 * 1.01e-6]))
-    assert found.values['with_it'] == pytest.approx(coupled)
+    active = Candidate(effect, off, ('size', 'with_it'), off).from_coefficients(np.array([main, 0.5 * 1.01e-6]))
+    assert active.values['with_it'] == pytest.approx(coupled)
 
 
 def test_noise_of_a_sum_is_no_gap() -> None:
@@ -451,11 +451,11 @@ def test_noise_of_a_sum_is_no_gap() -> None:
     volts[:, 5] += 4e-3 * (o.loads[:, 1] / np.abs(o.loads[:, 1]).max()) * rng.standard_normal(len(volts))
     workspace = Workspace([dataclasses.replace(o, volts=volts)])
     fit = refit(workspace, ())
-    found = laws.find_jitter(workspace, fit, 3.0)
-    assert found is not None
-    assert found.channels == ('sum2',)
-    assert found.heldout_gap == validate.heldout_gap(workspace, fit)
-    (term,) = found.law.terms
+    jitter = laws.find_jitter(workspace, fit, 3.0)
+    assert jitter is not None
+    assert jitter.channels == ('sum2',)
+    assert jitter.heldout_gap == validate.heldout_gap(workspace, fit)
+    (term,) = jitter.law.terms
     squares = workspace.split(fit.residual)[0][5] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
     _, b = law_features.variance(squares, known**2 / (known**2).max())
@@ -496,11 +496,11 @@ def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyP
 
 def test_what_a_law_leaves_is_reported_in_micrometres() -> None:
     law = SimpleNamespace(expression='y2 += 1', stage='psd', kind='straight')
-    found = SimpleNamespace(law=law, laws=[law], beside=[], heldout_gap=1.0)
-    answer = SimpleNamespace(law=found, effects=())
+    trial = SimpleNamespace(law=law, laws=[law], beside=[], heldout_gap=1.0)
+    answer = SimpleNamespace(law=trial, effects=())
     assert conclusion.law_sentence(cast(Any, answer)).endswith('on unseen load cases it leaves 1000000.000 µm.')
     creep = SimpleNamespace(effect=SimpleNamespace(name='creep'))
-    found.beside = [creep]
+    trial.beside = [creep]
     for named, words in (([], ', beside creep; on'), ([SimpleNamespace(active=creep)], 'y2 += 1; on')):
         answer.effects = named
         assert words in conclusion.law_sentence(cast(Any, answer))
@@ -526,24 +526,24 @@ def test_localisation_is_independent_of_fit_units() -> None:
     workspace = Workspace([make_observation(warm=None)])
     known = np.random.default_rng(3).standard_normal((len(workspace.whiten(workspace.measured)), 2))
     residual = workspace.residual([])[0]
-    one, other = (
+    first, other = (
         localise.localise(workspace, residual, k, np.random.default_rng(0)) for k in (known, known * [1e6, 1e-6])
     )
-    assert one.p == pytest.approx(other.p)
-    assert [d.gain for d in one.dependences] == pytest.approx([d.gain for d in other.dependences])
-    strong = {d.channel for d in one.dependences if d.p < 0.01}
-    assert {c.channel for c in one.cells if c.depends_on} <= strong < {c.channel for c in one.cells}
+    assert first.p == pytest.approx(other.p)
+    assert [d.gain for d in first.dependences] == pytest.approx([d.gain for d in other.dependences])
+    strong = {d.channel for d in first.dependences if d.p < 0.01}
+    assert {c.channel for c in first.cells if c.depends_on} <= strong < {c.channel for c in first.cells}
     # A column that is all of what noise draws leaves less of it.
-    assert [c.p for c in one.cells] == pytest.approx([c.p for c in other.cells])
+    assert [c.p for c in first.cells] == pytest.approx([c.p for c in other.cells])
 
 
 @pytest.mark.parametrize(('gains', 'share'), [((-5.0, 1.0), 0.0), ((3.0, 2.0), 0.5), ((30.0, 2.0), 1.0)])
 def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float], share: float) -> None:
     tie = weighing.Coincidence(((0, 'x'), (1, 'x')), (1.0, 1.0), 'V', 50.0)
     fit = SimpleNamespace(effects=(active('a', x=1.0), active('b', x=1.0)), chi2=90.0)
-    found = SimpleNamespace(delta_chi2=list(gains), null=SimpleNamespace(chi2=100.0))
+    result = SimpleNamespace(delta_chi2=list(gains), null=SimpleNamespace(chi2=100.0))
     (unknown,) = weighing.tied(
-        [tie], cast(Fit, fit), cast(SearchResult, found), cast(Any, SimpleNamespace(dependences=()))
+        [tie], cast(Fit, fit), cast(SearchResult, result), cast(Any, SimpleNamespace(dependences=()))
     )
     assert unknown.explains == pytest.approx(share)
     assert not unknown.unexplained
@@ -574,10 +574,10 @@ def test_variable_is_known_as_means_of_estimate_blocks() -> None:
         np.testing.assert_allclose(got, o.loads[:, 1].reshape(-1, 20).mean(axis=1), atol=1e-12)
 
 
-@pytest.mark.parametrize(('nominal', 'choices', 'kept'), [(1.0, (0, 1), 1), (0.0, (0, 1), 0), (5.0, (2, 3), 2)])
-def test_a_choice_that_makes_no_difference_stays_as_it_is(nominal: float, choices: tuple[int, ...], kept: int) -> None:
+@pytest.mark.parametrize(('nominal', 'choices', 'fixed'), [(1.0, (0, 1), 1), (0.0, (0, 1), 0), (5.0, (2, 3), 2)])
+def test_a_choice_that_makes_no_difference_stays_as_it_is(nominal: float, choices: tuple[int, ...], fixed: int) -> None:
     way = EffectParameter('way', '', 0, 9, 1, '', nominal=nominal, kind='choice', choices=choices)
-    assert plants.fixed_choice(way).choices == (kept,)
+    assert plants.fixed_choice(way).choices == (fixed,)
     psd = dataclasses.replace(way, each=True)
     size = EffectParameter('size', 'V', -1.0, 1.0, 0.1, '')
     assert plants.fixed_choice(psd) is psd

@@ -165,15 +165,15 @@ class Searches:
         monkeypatch.setattr(
             loop,
             'next_of',
-            lambda found, _: SimpleNamespace(useful=useful and bool(found.unsettled), sentence='Nothing helps.'),
+            lambda study, _: SimpleNamespace(useful=useful and bool(study.unsettled), sentence='Nothing helps.'),
         )
 
     def search(self, known: Sequence[Observation]) -> Discovery:
         self.observed.append(len(known))
-        left = ('other',) * max(self.equivalents - len(known) + 1, 0)
-        alternatives = [SimpleNamespace(parameters=self.free)] * len(left)
+        tied = ('other',) * max(self.equivalents - len(known) + 1, 0)
+        alternatives = [SimpleNamespace(parameters=self.free)] * len(tied)
         return cast(
-            Discovery, SimpleNamespace(unsettled=left, alternative_fits=alternatives, fit=SimpleNamespace(parameters=1))
+            Discovery, SimpleNamespace(unsettled=tied, alternative_fits=alternatives, fit=SimpleNamespace(parameters=1))
         )
 
     def settle(self, most: int | None = None) -> loop.LoopResult:
@@ -283,7 +283,7 @@ def answer() -> Isolability:
 
 
 def of(label: str) -> Isolable:
-    return next(one for one in answer().effects if one.label == label)
+    return next(effect for effect in answer().effects if effect.label == label)
 
 
 def searched(name: str, **values: float) -> Discovery:
@@ -295,24 +295,24 @@ def searched(name: str, **values: float) -> Discovery:
 
 @pytest.mark.slow
 def test_it_says_from_which_size_a_search_names_an_effect() -> None:
-    one = of('sensor_rotation (psd 2)')
-    assert one.parameter == 'angle'
-    assert one.observed is not None
-    assert one.named is not None
-    assert not searched('sensor_rotation', psd=2, angle=0.5 * one.observed).effects
-    found = searched('sensor_rotation', psd=2, angle=2.0 * one.named)
-    assert [e.active.label for e in found.effects] == [one.label]
-    assert not found.unsettled
+    effect = of('sensor_rotation (psd 2)')
+    assert effect.parameter == 'angle'
+    assert effect.observed is not None
+    assert effect.named is not None
+    assert not searched('sensor_rotation', psd=2, angle=0.5 * effect.observed).effects
+    discovery = searched('sensor_rotation', psd=2, angle=2.0 * effect.named)
+    assert [e.active.label for e in discovery.effects] == [effect.label]
+    assert not discovery.unsettled
 
 
 @pytest.mark.slow
 def test_it_says_what_a_search_cannot_separate() -> None:
-    one = of('bending_stiffness (moves_frequency 0)')
-    assert one.observed is not None
-    assert (one.named, one.alike) == (None, 'clamp_bending_compliance')
+    effect = of('bending_stiffness (moves_frequency 0)')
+    assert effect.observed is not None
+    assert (effect.named, effect.alike) == (None, 'clamp_bending_compliance')
     # A softer link: a clamp cannot make it stiffer.
-    found = searched('bending_stiffness', scale=-100.0 * one.observed, moves_frequency=0)
-    names = {e.active.effect.name for e in found.effects} | set(found.unsettled)
+    discovery = searched('bending_stiffness', scale=-100.0 * effect.observed, moves_frequency=0)
+    names = {e.active.effect.name for e in discovery.effects} | set(discovery.unsettled)
     assert {'bending_stiffness', 'clamp_bending_compliance'} <= names
 
 
@@ -322,7 +322,7 @@ def test_what_does_not_show_is_listed_with_what_it_needs() -> None:
     still = isolable(RIG, np.zeros((2000, 3)), 'no load')
     assert 'bending_stiffness (moves_frequency 1)' in still.hidden
     # Where a PSD is shows without any load.
-    assert any(one.label == 'sensor_position (psd 1, aimed 0)' for one in still.effects)
+    assert any(effect.label == 'sensor_position (psd 1, aimed 0)' for effect in still.effects)
     assert 'axis_crosstalk (psd 1)' not in isolable(RIG, LOADS, without=['axis_crosstalk']).hidden
 
 
@@ -338,26 +338,26 @@ def test_sizes_are_those_whose_chi_square_a_search_accepts() -> None:
     """Each is simulated at its size, beside the rig as it is."""
     loads = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (20.0, 0.0, 0.0), (0.0, 0.0, 8.0)], 500, axis=0)
     few = {'sensor_rotation': {'psd': 2}, 'ambient_light': {'psd': 1}}
-    found = isolable(RIG, loads, without=[name for name in effect_names() if name not in few])
+    listed = isolable(RIG, loads, without=[name for name in effect_names() if name not in few])
     sigma = RIG.noises.reshape(-1, 1) / 2.0
 
     def shown(*effects: ActiveEffect) -> FloatArray:
         return np.asarray(fine_means(ForwardModel(RIG, effects).expect(loads).volts, 4) / sigma)
 
     for name, choice in few.items():
-        (one,) = (e for e in found.effects if e.label.startswith(f'{name} (psd {choice["psd"]}'))
-        active = make_active(name, {**choice, one.parameter: one.observed}, 'test')
+        (effect,) = (e for e in listed.effects if e.label.startswith(f'{name} (psd {choice["psd"]}'))
+        active = make_active(name, {**choice, effect.parameter: effect.observed}, 'test')
         count = sum(p.kind != 'choice' for p in active.effect.parameters)
-        by_chance = chi2.isf(1e-4 / len(found.effects), count)
+        by_chance = chi2.isf(1e-4 / len(listed.effects), count)
         accepted = max(by_chance, count * math.log(6 * 100) + 10.0)
         assert np.sum((shown(active) - shown()) ** 2) == pytest.approx(accepted, rel=0.1)
-        assert one.observed is not None
-        larger = max(1.0, math.sqrt(SEPARATES / one.apart / accepted))
-        assert one.named == pytest.approx(larger * one.observed, rel=1e-3)
-    named = [e.named if e.named is not None else math.nan for e in found.effects]
-    np.testing.assert_array_equal(found.table().column('named'), named)
+        assert effect.observed is not None
+        larger = max(1.0, math.sqrt(SEPARATES / effect.apart / accepted))
+        assert effect.named == pytest.approx(larger * effect.observed, rel=1e-3)
+    named = [e.named if e.named is not None else math.nan for e in listed.effects]
+    np.testing.assert_array_equal(listed.table().column('named'), named)
     # Both change the size of whatever the loads move; an effect of more numbers is no answer for one of fewer.
-    alike = {e.label: e.alike for e in found.effects}
+    alike = {e.label: e.alike for e in listed.effects}
     assert (alike['sensitivity'], alike['link_length']) == ('link_length', 'sensitivity')
 
 
@@ -413,16 +413,16 @@ def observed(corner: float, seed: int, angle: float = 0.0) -> Observation:
 @pytest.mark.parametrize('corner', [0.5, 2.0, 10.0, 50.0])
 def test_the_corner_is_that_of_the_noise(corner: float) -> None:
     parts = [flicker(6000, PERIOD, corner, seed).T for seed in (1, 2)]
-    found = corners_of(parts, [PERIOD, PERIOD])
-    assert found == pytest.approx(np.full(6, corner), rel=0.45)
-    assert np.median(found) == pytest.approx(corner, rel=0.25)
+    corners = corners_of(parts, [PERIOD, PERIOD])
+    assert corners == pytest.approx(np.full(6, corner), rel=0.45)
+    assert np.median(corners) == pytest.approx(corner, rel=0.25)
 
 
 def test_white_noise_has_no_corner_that_matters() -> None:
     white = [np.random.default_rng(seed).normal(size=(6, 6000)) for seed in range(20)]
-    found = [corners_of([rows], [PERIOD]).max() for rows in white]
-    assert np.mean(np.array(found) == 0.0) > 0.5
-    assert max(found) < 0.2
+    corners = [corners_of([rows], [PERIOD]).max() for rows in white]
+    assert np.mean(np.array(corners) == 0.0) > 0.5
+    assert max(corners) < 0.2
 
 
 def test_slow_noise_without_light_is_not_electronic() -> None:
@@ -441,9 +441,9 @@ def test_slow_noise_of_a_channel_is_at_most_that_of_the_light() -> None:
     rows = flicker(6000, PERIOD, 2.0, 1).T
     usual = corners_of([rows], [PERIOD])
     rows[0] += 3.0 * np.sin(np.arange(6000) / 400.0)
-    found = corners_of([rows], [PERIOD])
-    assert found[0] <= 1.3 * usual[[2, 5]].min()
-    assert found[1:].tolist() == usual[1:].tolist()
+    corners = corners_of([rows], [PERIOD])
+    assert corners[0] <= 1.3 * usual[[2, 5]].min()
+    assert corners[1:].tolist() == usual[1:].tolist()
 
 
 def test_outliers_and_lost_samples_make_no_corner() -> None:
@@ -484,8 +484,8 @@ def test_the_mean_of_a_block_is_as_uncertain_as_the_formula_says(corner: float) 
 
 
 def model(corners: FloatArray) -> NoiseModel:
-    one = np.ones(6)
-    plain = NoiseModel(one, np.zeros((6, 2)), 2.0 * one, 0.5 * one, 3.0, (False,) * 6)
+    ones = np.ones(6)
+    plain = NoiseModel(ones, np.zeros((6, 2)), 2.0 * ones, 0.5 * ones, 3.0, (False,) * 6)
     return plain.with_slow_noise(corners, 1000, PERIOD, 0.02)
 
 
@@ -506,12 +506,12 @@ def test_noise_model_whitens_by_both_and_keeps_gaps() -> None:
 
 
 def test_corners_within_a_fifth_are_alike() -> None:
-    some = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    assert model(some).like(model(1.15 * some))
-    assert not model(some).like(model(1.3 * some))
-    assert not model(some).like(model(np.zeros(6)))
-    assert not model(some).like(dataclasses.replace(model(some), coloured=(True,) * 6))
-    assert not model(some).like(dataclasses.replace(model(some), innovation=2.1 * np.ones(6)))
+    corners = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    assert model(corners).like(model(1.15 * corners))
+    assert not model(corners).like(model(1.3 * corners))
+    assert not model(corners).like(model(np.zeros(6)))
+    assert not model(corners).like(dataclasses.replace(model(corners), coloured=(True,) * 6))
+    assert not model(corners).like(dataclasses.replace(model(corners), innovation=2.1 * np.ones(6)))
     assert model(np.zeros(6)).slow is None
 
 
@@ -529,9 +529,9 @@ def test_workspace_reports_slow_noise_of_recording() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize('corner', [0.3, 5.0])
 def test_nothing_is_missing_from_slow_noise(corner: float) -> None:
-    found = discover([observed(corner, 1)])
-    assert found.verdict == 'nothing_missing'
-    assert not found.setup
+    discovery = discover([observed(corner, 1)])
+    assert discovery.verdict == 'nothing_missing'
+    assert not discovery.setup
 
 
 BAG = Path(__file__).parents[3] / 'bags' / 'clean'
@@ -566,23 +566,23 @@ def test_residual_of_noisy_zero_is_nothing_unknown(faultless: Discovery) -> None
 
 @pytest.mark.slow
 def test_the_same_constants_are_reported_if_no_zero_was_taken() -> None:
-    found = discover([recorded(taken=False)])
-    assert found.effects or found.unknown
+    discovery = discover([recorded(taken=False)])
+    assert discovery.effects or discovery.unknown
 
 
 def test_a_constant_is_whitened_by_what_the_zero_allows() -> None:
     """One standard deviation of a well seen constant leaves a residual of about one standard deviation of noise."""
     o = recorded(taken=True)
     ws = Workspace([o])
-    own = with_free(Recorded((o,), RIG, ()), ws)
+    free = with_free(Recorded((o,), RIG, ()), ws)
     constant = [np.zeros_like(t) for t in ws.measured]
     axis = 3
     constant[0][DOT_CHANNELS[axis]] = np.sqrt(ZERO[axis]) / RIG.sensitivities.ravel()[axis]
     observed = float(np.linalg.norm(ws.whiten(constant)))
     assert observed > 5.0
-    assert np.linalg.norm(own.whiten(constant)) == pytest.approx(observed / np.hypot(1.0, observed), rel=1e-9)
-    assert not own.free_loads
-    assert own.refitted(ws.measured) is own
+    assert np.linalg.norm(free.whiten(constant)) == pytest.approx(observed / np.hypot(1.0, observed), rel=1e-9)
+    assert not free.free_loads
+    assert free.refitted(ws.measured) is free
 
 
 @pytest.mark.parametrize(
@@ -625,8 +625,8 @@ def test_a_size_that_hardly_any_load_shows_stays_off(sideways: float) -> None:
     volts = RigSimulator(true, 3).step(history).counts * RIG.converter.volts_per_count
     workspace = Workspace([Observation('x', RIG, np.asarray(volts, dtype=np.float64), history)], ())
     effect = catalogue()['load_offset']
-    found = refit(workspace, [ActiveEffect(effect, {'x': 0.001, 'y': -1.0})])
-    (offset,) = found.effects
+    fitted = refit(workspace, [ActiveEffect(effect, {'x': 0.001, 'y': -1.0})])
+    (offset,) = fitted.effects
     assert offset.values['x'] == pytest.approx(0.005, abs=1e-4)
     assert offset.values['y'] == 0.0
-    assert not found.at_bound
+    assert not fitted.at_bound

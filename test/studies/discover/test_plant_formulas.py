@@ -89,15 +89,15 @@ def rms(values: FloatArray) -> float:
 
 def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     observed = holed()
-    left = [0.5 * rows for rows in observed]
-    forces, turns = full(observed, 0), full(observed, 1)
+    residual = [0.5 * rows for rows in observed]
+    forces, angles = full(observed, 0), full(observed, 1)
     ws = PlantComparison(Pictures(observed, {}))
-    assert ws.gap_per_channel(left) == pytest.approx([0.5 * rms(forces), 0.5 * rms(turns)])
+    assert ws.gap_per_channel(residual) == pytest.approx([0.5 * rms(forces), 0.5 * rms(angles)])
     assert math.isnan(ws.floor())
     ws = ws.begun(refit(ws, ()))
     # Newtons and radians have no sum: each is a share of its gap before.
     assert ws.gap(observed) == pytest.approx(1.0)
-    assert ws.gap(left) == pytest.approx(0.5)
+    assert ws.gap(residual) == pytest.approx(0.5)
     mixed = [rows * [[1.0], [0.5]] for rows in observed]
     assert ws.gap(mixed) == pytest.approx(math.sqrt((1.0 + 0.25) / 2.0))
     assert (ws.unit, ws.display_scale, ws.display_units) == (
@@ -114,15 +114,15 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     ws = PlantComparison(with_lever)
     ws = ws.begun(refit(ws, ()))
     count = [np.isfinite(full(observed, k)).sum() for k in (0, 1)]
-    squares = count[0] * rms(forces) ** 2 + count[1] * (0.1 * rms(turns)) ** 2
+    squares = count[0] * rms(forces) ** 2 + count[1] * (0.1 * rms(angles)) ** 2
     assert ws.gap(observed) == pytest.approx(math.sqrt(squares / sum(count)))
-    assert ws.gap_per_channel(observed) == pytest.approx([rms(forces), rms(turns)])
+    assert ws.gap_per_channel(observed) == pytest.approx([rms(forces), rms(angles)])
     assert (ws.unit, ws.worded(0.1234)) == ('N', '0.123 N')
     with_lever.levers = (1.0,)
     with pytest.raises(ConfigError, match=r'levers = \(1\.0,\): must be one number above 0 for each channel'):
         PlantComparison(with_lever)
     same = PlantComparison(Pictures(observed, {}, units=('N', 'N'), noise=(0.3, 0.1)))
-    both = np.concatenate((forces, turns))
+    both = np.concatenate((forces, angles))
     assert same.gap(observed) == pytest.approx(rms(both))
     assert same.floor() == pytest.approx(math.sqrt((28 * 0.3**2 + 22 * 0.1**2) / 50))
     assert (same.unit, same.display_scale, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
@@ -154,8 +154,8 @@ def test_few_values_make_the_interval_of_student() -> None:
     x, y = np.concatenate(reported), np.concatenate([rows[0] for rows in values])
     picture = [np.stack([part, 0.0 * part]) for part in reported]
     size = float(x @ y / (x @ x))
-    left = float(np.sum((y - size * x) ** 2)) / (len(x) - 1)
-    wanted = math.sqrt(left / float(x @ x)) * student.ppf(0.975, len(x) - 1) / norm.ppf(0.975)
+    variance = float(np.sum((y - size * x) ** 2)) / (len(x) - 1)
+    wanted = math.sqrt(variance / float(x @ x)) * student.ppf(0.975, len(x) - 1) / norm.ppf(0.975)
     assert sd_of_size(values, picture) == pytest.approx(wanted, rel=1e-3)
     both = [np.stack([part, 0.1 * part]) for part in reported]
     parts, freedom = [], []
@@ -376,11 +376,11 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     assert [channel for channel, _ in named] == ['force', 'turn']
     for c, (channel, of) in enumerate(named):
         for i, n in enumerate(LENGTHS):
-            own = 0.5 * tables(4)[i][c] * np.isfinite(observed[i][c])
+            data = 0.5 * tables(4)[i][c] * np.isfinite(observed[i][c])
             want = {'constant': np.ones(n), 'u': given[i], 'u^2': given[i] ** 2, 'u^3': given[i] ** 3}
-            want.update({channel: own, f'{channel}^2': own**2, f'{channel}^3': own**3, f'|{channel}|': abs(own)})
+            want.update({channel: data, f'{channel}^2': data**2, f'{channel}^3': data**3, f'|{channel}|': abs(data)})
             if period:
-                t, rate = 2.0 * np.arange(n) / (n - 1) - 1.0, np.gradient(own)
+                t, rate = 2.0 * np.arange(n) / (n - 1) - 1.0, np.gradient(data)
                 want.update({'time': t, 'time^2': t * t})
                 want.update({f'rate of {channel}': rate, f'sign of rate of {channel}': np.sign(rate)})
             assert set(of) == set(want)
@@ -402,8 +402,8 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
     ws = PlantComparison(plant)
     fit = refit(ws, ())
-    found = plant_search.localise_cases(ws, fit, None)
-    cells = {(c.channel, c.recording): c for c in found.cells}
+    located = plant_search.localise_cases(ws, fit, None)
+    cells = {(c.channel, c.recording): c for c in located.cells}
     assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
     for (channel, case), cell in cells.items():
         c = ws.channels.index(channel)
@@ -418,16 +418,16 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
         # Wilson and Hilferty: the cube root of a chi-square over its mean is normal.
         deviation = 2.0 / (9.0 * dof)
         assert cell.statistic == pytest.approx(((energy / dof) ** (1 / 3) - 1.0 + deviation) / math.sqrt(deviation))
-        assert found.map[case, c, 0] == cell.statistic
+        assert located.map[case, c, 0] == cell.statistic
         assert cell.when == (0.0, LENGTHS[case] * period)
         assert cell.band == (0.0, 0.5 / period if period else 0.0)
-        names = [d.regressor for d in found.dependences if d.channel == channel and d.p < 0.01]
+        names = [d.regressor for d in located.dependences if d.channel == channel and d.p < 0.01]
         assert cell.depends_on == tuple(names[:2])
-    assert found.map.shape == (3, 2, 1)
-    assert found.map[1, 1, 0] == 0.0
-    assert [c.statistic for c in found.cells] == sorted((c.statistic for c in found.cells), reverse=True)
-    assert found.spans == tuple((i, 0.0, n * period) for i, n in enumerate(LENGTHS))
-    assert (found.excess, found.p) == (found.dependences[0].gain, found.dependences[0].p)
+    assert located.map.shape == (3, 2, 1)
+    assert located.map[1, 1, 0] == 0.0
+    assert [c.statistic for c in located.cells] == sorted((c.statistic for c in located.cells), reverse=True)
+    assert located.spans == tuple((i, 0.0, n * period) for i, n in enumerate(LENGTHS))
+    assert (located.excess, located.p) == (located.dependences[0].gain, located.dependences[0].p)
 
 
 def steel(size: float, seed: int = 0, **given: Any) -> Pictures:
@@ -446,38 +446,38 @@ def least_squares(plant: Pictures, *names: str) -> tuple[FloatArray, list[FloatA
     matrix = np.stack([np.concatenate([p.ravel() for p in plant.shown[n]]) for n in names], axis=1)
     data = np.concatenate([s.ravel() for s in plant.observed])
     sizes = np.linalg.lstsq(matrix, data, rcond=None)[0]
-    left = (data - matrix @ sizes).reshape(4, 2, 30)
-    return sizes, list(left), np.linalg.inv(matrix.T @ matrix)
+    residual = (data - matrix @ sizes).reshape(4, 2, 30)
+    return sizes, list(residual), np.linalg.inv(matrix.T @ matrix)
 
 
 def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
     message: list[str] = []
     plant = steel(0.4, noise=(0.02, 0.02))
-    found = discover_in(plant, seed=5, progress=message.append)
-    (named,) = found.effects
-    (size, other), left, inverse = least_squares(plant, 'b', 'c')
+    study = discover_in(plant, seed=5, progress=message.append)
+    (named,) = study.effects
+    (size, other), residual, inverse = least_squares(plant, 'b', 'c')
     _, before, _ = least_squares(plant, 'c')
-    assert (found.verdict, found.unknown, found.seed) == ('effects_found', (), 5)
+    assert (study.verdict, study.unknown, study.seed) == ('effects_found', (), 5)
     assert named.active.effect.name == 'b'
     assert named.active.values['size'] == pytest.approx(size, abs=1e-3)
-    ((nuisance, sd),) = found.nuisance
+    ((nuisance, sd),) = study.nuisance
     assert nuisance.values['size'] == pytest.approx(other, abs=1e-3)
     # From the noise, or from the scatter over the folds, whichever is greater.
     assert named.sd['size'] >= 0.9 * 0.02 * math.sqrt(inverse[0, 0])
     assert sd['size'] >= 0.9 * 0.02 * math.sqrt(inverse[1, 1])
     assert max(named.sd['size'], sd['size']) < 3.0 * 0.02 * math.sqrt(inverse.max())
-    gaps = [rms(np.concatenate([rows.ravel() for rows in tables_of])) for tables_of in (before, left)]
-    assert (found.gap_before, found.gap_after) == pytest.approx(tuple(gaps), rel=1e-3)
-    assert found.gap_floor == pytest.approx(0.02)
-    assert found.floors == pytest.approx(gaps[1] / 0.02, rel=1e-3)
-    assert gaps[1] < found.gap_heldout_after < 1.1 * gaps[1]
-    assert gaps[0] < found.gap_heldout_before < 1.1 * gaps[0]
+    gaps = [rms(np.concatenate([rows.ravel() for rows in tables_of])) for tables_of in (before, residual)]
+    assert (study.gap_before, study.gap_after) == pytest.approx(tuple(gaps), rel=1e-3)
+    assert study.gap_floor == pytest.approx(0.02)
+    assert study.floors == pytest.approx(gaps[1] / 0.02, rel=1e-3)
+    assert gaps[1] < study.gap_heldout_after < 1.1 * gaps[1]
+    assert gaps[0] < study.gap_heldout_before < 1.1 * gaps[0]
     for i, channel in enumerate(('force', 'turn')):
-        pair = tuple(rms(np.concatenate([rows[i] for rows in tables_of])) for tables_of in (before, left))
-        assert found.per_channel[channel] == pytest.approx(pair, rel=1e-3)
-        assert found.heldout_per_channel[channel] == pytest.approx(pair[1], rel=0.1)
-    assert found.waterfall == (('as described', found.gap_before), ('+ b', found.gap_after), ('noise alone', 0.02))
-    assert found.simulations == len(plant.asked)
+        pair = tuple(rms(np.concatenate([rows[i] for rows in tables_of])) for tables_of in (before, residual))
+        assert study.per_channel[channel] == pytest.approx(pair, rel=1e-3)
+        assert study.heldout_per_channel[channel] == pytest.approx(pair[1], rel=0.1)
+    assert study.waterfall == (('as described', study.gap_before), ('+ b', study.gap_after), ('noise alone', 0.02))
+    assert study.simulations == len(plant.asked)
     assert message[0] == 'simulating the plant as it is described'
     assert [s for s in message if s in ('signatures of every effect', 'weighing', 'alternatives', 'where')] == [
         'signatures of every effect',
@@ -486,21 +486,21 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         'where',
     ]
     # Where it was before the effect, and where nothing is left after it.
-    assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.residual.cells)
-    assert found.residual.p > 1e-4
-    assert found.sentence.startswith('b is missing from the model; adding it closes the gap from')
-    assert repr(found) == (
-        f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '
+    assert max(c.statistic for c in study.where.cells) > 8.0 > max(c.statistic for c in study.residual.cells)
+    assert study.residual.p > 1e-4
+    assert study.sentence.startswith('b is missing from the model; adding it closes the gap from')
+    assert repr(study) == (
+        f'<PlantDiscovery effects_found: b; gap {study.gap_before:.3g} N → {study.gap_after:.3g} N '
         '(noise alone: 0.02 N)>'
     )
 
 
 def test_noise_of_a_plant_is_nothing_missing() -> None:
-    found = discover_in(steel(0.0))
-    assert (found.verdict, found.effects, found.unknown) == ('nothing_missing', (), ())
-    assert found.gap_before == found.gap_after
+    discovery = discover_in(steel(0.0))
+    assert (discovery.verdict, discovery.effects, discovery.unknown) == ('nothing_missing', (), ())
+    assert discovery.gap_before == discovery.gap_after
     # Nobody said how much noise there is.
-    assert math.isnan(found.gap_floor)
-    assert found.floors == 0.0
-    assert '(noise alone: not known)' in repr(found)
-    assert 'no effect' in repr(found)
+    assert math.isnan(discovery.gap_floor)
+    assert discovery.floors == 0.0
+    assert '(noise alone: not known)' in repr(discovery)
+    assert 'no effect' in repr(discovery)

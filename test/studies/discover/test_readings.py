@@ -71,11 +71,11 @@ def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytes
     answer = capsys.readouterr()
     assert 'note: a table of readings holds no parameters: the rig of the thesis is taken; --params-file' in answer.err
     assert 'bending_stiffness' in answer.out
-    found = json.loads((tmp_path / 'found' / 'result.json').read_text())
-    (effect,) = found['effects']
+    tree = json.loads((tmp_path / 'found' / 'result.json').read_text())
+    (effect,) = tree['effects']
     # One length of the link does not tell stiffness from the clamp.
     assert {effect['name'], *effect['equivalent']} == {'bending_stiffness', 'clamp_bending_compliance'}
-    assert found['gap']['heldout_after'] < 1.5 * 1e6 * NOISE < 10.0 < found['gap']['before']
+    assert tree['gap']['heldout_after'] < 1.5 * 1e6 * NOISE < 10.0 < tree['gap']['before']
     repaired = load_rig(tmp_path / 'found' / 'model.yaml')
     assert discover_in(ReadingsPlant(read_tables([table], repaired))).verdict == 'nothing_missing'
 
@@ -105,8 +105,8 @@ def test_what_depends_on_time_or_on_the_row_before_takes_no_part() -> None:
 def test_a_settled_reading_is_what_a_long_hold_ends_with() -> None:
     effects = [make_active('self_weight', {'weight_per_length': 20.0}, 'test'), SOFT]
     held = ForwardModel(RIG, effects).expect(np.tile(LOADS[8], (20_000, 1))).volts[:, -1]
-    settled = ForwardModel(RIG, effects, steady=True).expect(LOADS[8:9]).volts[:, 0]
-    np.testing.assert_allclose(settled, held, rtol=1e-9, atol=1e-9)
+    steady = ForwardModel(RIG, effects, steady=True).expect(LOADS[8:9]).volts[:, 0]
+    np.testing.assert_allclose(steady, held, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -217,10 +217,10 @@ def test_dial_gauge_is_searched_beside_empty_columns(tmp_path: Path, rest: str) 
     masses = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
     rows = [f'{m},{rest},{min(-31.6e-3 * m, 0.0) if m < 1.4 else -31.6e-3 * 1.2:.6f},{rest}' for m in masses]
     (tmp_path / 'beam.csv').write_text('\n'.join(['mass,ref_dx,ref_dy,ref_theta', *rows]) + '\n')
-    found = discover_in(ReadingsPlant(read_tables([tmp_path / 'beam.csv'])))
-    assert found.verdict in ('effects_found', 'unknown_effect')
-    assert 0.0 < found.gap_before < 0.1 * 1e6
-    assert found.per_channel['ref_dx'][0] == 0.0
+    discovery = discover_in(ReadingsPlant(read_tables([tmp_path / 'beam.csv'])))
+    assert discovery.verdict in ('effects_found', 'unknown_effect')
+    assert 0.0 < discovery.gap_before < 0.1 * 1e6
+    assert discovery.per_channel['ref_dx'][0] == 0.0
 
 
 TABLE_LOADS = np.array(
@@ -262,14 +262,14 @@ def test_reference_names_link_effect_with_late_loads(tmp_path: Path, capsys: pyt
     bag = recorded(tmp_path / 'camera.mcap', [SOFT])
     assert main(['discover', str(bag), '--out', str(tmp_path / 'found')]) == 0
     assert 'bending_stiffness' in capsys.readouterr().out
-    found = json.loads((tmp_path / 'found' / 'result.json').read_text())
-    (effect,) = found['effects']
+    tree = json.loads((tmp_path / 'found' / 'result.json').read_text())
+    (effect,) = tree['effects']
     assert {effect['name'], *effect['equivalent']} == {'bending_stiffness', 'clamp_bending_compliance'}
     # Metres and radians are one gap, of what moves at the distance of the PSDs.
-    assert found['gap']['unit'] == 'µm'
-    of_each = [c['before'] for c in found['gap']['per_channel'].values()]
+    assert tree['gap']['unit'] == 'µm'
+    of_each = [c['before'] for c in tree['gap']['per_channel'].values()]
     distance = float(np.sqrt(np.mean(np.sum(RIG.centers**2, axis=1))))
-    assert found['gap']['before'] == pytest.approx(float(np.sqrt(np.mean(np.multiply(of_each, (1, 1, distance)) ** 2))))
+    assert tree['gap']['before'] == pytest.approx(float(np.sqrt(np.mean(np.multiply(of_each, (1, 1, distance)) ** 2))))
     repaired = load_rig(tmp_path / 'found' / 'model.yaml')
     assert discover_in(ReadingsPlant(read_tables([bag], repaired))).verdict == 'nothing_missing'
 
@@ -329,20 +329,20 @@ def make_observation(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, o
     ('word', 'name', 'value'), [('sensor_rotation,psd=3,angle=0.01', 'angle', 0.01), ('load_offset,x=0.01', 'x', 0.01)]
 )
 def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: float) -> None:
-    (effect,) = (found := discover([make_observation(THREE, word)])).effects
+    (effect,) = (discovery := discover([make_observation(THREE, word)])).effects
     wanted = dict(pair.split('=') for pair in word.split(',')[1:])
     assert effect.active.effect.name == word.split(',', maxsplit=1)[0]
     assert effect.active.values.get('psd', 0.0) == float(wanted.get('psd', 0.0))
     assert effect.active.values[name] == pytest.approx(value, abs=4.0 * effect.sd[name])
-    assert (found.verdict, found.setup) == ('effects_found', ())
-    assert list(found.per_channel) == list(dot_names(3))
+    assert (discovery.verdict, discovery.setup) == ('effects_found', ())
+    assert list(discovery.per_channel) == list(dot_names(3))
 
 
 @pytest.mark.slow
 def test_wrong_wiring_and_effect_of_six_psds_are_named() -> None:
-    found = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
-    assert [(f.name, f.where) for f in found.setup] == [('channel_sign', 'x6')]
-    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 5)']
+    discovery = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
+    assert [(f.name, f.where) for f in discovery.setup] == [('channel_sign', 'x6')]
+    assert [e.active.label for e in discovery.effects] == ['sensor_rotation (psd 5)']
 
 
 def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

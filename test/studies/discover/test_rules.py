@@ -98,8 +98,8 @@ class Plant(Workspace):
 class Lone(Machine):
     """A machine with nothing but a comparison. ``left``: where every fit leaves structure."""
 
-    def __init__(self, plant: Workspace, left: Localisation = NOWHERE) -> None:
-        self.plant, self.left = plant, left
+    def __init__(self, plant: Workspace, residual: Localisation = NOWHERE) -> None:
+        self.plant, self.residual = plant, residual
 
     def compared(self) -> Workspace:
         return self.plant
@@ -111,18 +111,18 @@ class Lone(Machine):
         return [(c, {}) for c in comparison.channels]
 
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
-        return self.left
+        return self.residual
 
     def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> planning.Suggestion | None:
         return planning.Suggestion(f'try {len(equal)}', 1.0)
 
 
 def problem_of(
-    search: Search, result: SearchResult, heldout: Sequence[HeldOut] = (), left: Localisation = NOWHERE
+    search: Search, result: SearchResult, heldout: Sequence[HeldOut] = (), residual: Localisation = NOWHERE
 ) -> Problem:
     """What the search of a lone machine found, before it is weighed."""
     return Problem(
-        machine=Lone(cast(Workspace, search.workspace), left),
+        machine=Lone(cast(Workspace, search.workspace), residual),
         search=search,
         result=result,
         fit=result.fit,
@@ -165,10 +165,10 @@ def search_of(plant: Plant, library: int = 1, penalty: float = 3.0) -> Search:
     return search
 
 
-def result_of(search: Search, effects: Sequence[ActiveEffect], others: Sequence[Sequence[Fit]] = ()) -> SearchResult:
+def result_of(search: Search, effects: Sequence[ActiveEffect], tied_fits: Sequence[Sequence[Fit]] = ()) -> SearchResult:
     null, fit = refit(search.workspace, ()), refit(search.workspace, effects)
     p, bic, gains = search.weigh(null, fit)
-    return SearchResult(null, fit, p, bic, gains, alternatives=[list(o) for o in others])
+    return SearchResult(null, fit, p, bic, gains, alternatives=[list(o) for o in tied_fits])
 
 
 A, B = ('a', 'x'), ('b', 'x')
@@ -220,8 +220,8 @@ def test_a_refit_stops_at_a_bound_and_the_rest_adapts() -> None:
         )
         assert fit.at_bound == ((0, 'x'),)
         assert fit.effects[0].values['x'] == end
-        left = (plant.measured[0] - end * shown['a', 'x']).ravel()
-        want = left @ shown['b', 'x'].ravel() / np.sum(shown['b', 'x'] ** 2)
+        residual = (plant.measured[0] - end * shown['a', 'x']).ravel()
+        want = residual @ shown['b', 'x'].ravel() / np.sum(shown['b', 'x'] ** 2)
         assert fit.effects[1].values['x'] == pytest.approx(want, abs=1e-8)
     # A bound that the start lies beyond is where it begins.
     assert refit(plant, [active('a', -1.0, 2e-3, x=0.9)], iterations=0).effects[0].values['x'] == 2e-3
@@ -301,18 +301,18 @@ class Basins(Plant):
 
 
 @pytest.mark.parametrize(
-    ('starts', 'size', 'found'),
+    ('starts', 'size', 'fitted'),
     # Of no use are a start that leaves more, and any if little is left.
     [((), 1.0, -0.5), ((1.05,), 1.0, 1.1), ((0.6, 1.05, 0.9), 1.0, 1.1), ((0.6,), 1.0, -0.5), ((1.05,), 0.01, -0.5)],
 )
-def test_a_fit_that_is_far_off_is_tried_from_elsewhere(starts: tuple[float, ...], size: float, found: float) -> None:
+def test_a_fit_that_is_far_off_is_tried_from_elsewhere(starts: tuple[float, ...], size: float, fitted: float) -> None:
     shown = {A: size * pictures(A)[A]}
     search = search_of(Basins(shown, (1.1**3 - 0.75 * 1.1) * shown[A]))
     parameter = EffectParameter('x', 'V', -2.0, 2.0, 1e-2, '', starts=starts)
     start = ActiveEffect(dataclasses.replace(effect('a', 'x'), parameters=(parameter,)), {'x': -0.6})
     best = search.best_of([[start]], 1, 30)
     assert best is not None
-    assert best.effects[0].values['x'] == pytest.approx(found, abs=0.01)
+    assert best.effects[0].values['x'] == pytest.approx(fitted, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -429,10 +429,10 @@ def test_simulation_error_counts_only_where_it_explains(gain: float, channel: in
     shown[A][0] = np.sin(2.0 * np.pi * at / 40.0)
     shown[B][channel] = np.cos(2.0 * np.pi * at / 40.0)
     search = search_of(Plant(shown, without_noise((shown[A], 1e8), (shown[B], gain))))
-    null, one = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
+    null, single = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
     both = refit(search.workspace, [active('a', x=0.0), active('b', x=0.0)])
-    assert one.chi2 - both.chi2 == pytest.approx(gain, rel=1e-3)
-    assert search.passes(one, both, null) == stays
+    assert single.chi2 - both.chi2 == pytest.approx(gain, rel=1e-3)
+    assert search.passes(single, both, null) == stays
 
 
 @pytest.mark.parametrize(
@@ -468,15 +468,15 @@ def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tu
     assert bic == pytest.approx(loss + 3.0 * (len(names) - 1))
 
 
-@pytest.mark.parametrize(('remains', 'kept'), [(200.0, ['a', 'c']), (420.0, ['a', 'c']), (1000.0, ['c'])])
-def test_weak_effects_are_dropped_before_alternatives(remains: float, kept: list[str]) -> None:
+@pytest.mark.parametrize(('remains', 'names'), [(200.0, ['a', 'c']), (420.0, ['a', 'c']), (1000.0, ['c'])])
+def test_weak_effects_are_dropped_before_alternatives(remains: float, names: list[str]) -> None:
     shown = pictures(A, B, ('c', 'x'))
     plant = Plant(shown, without_noise((shown[A], 500.0), (shown['c', 'x'], 4000.0), (shown[B], remains)) + noise())
-    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'c')]
-    search = Search(plant, lambda workspace, _: Screen(workspace, found))
+    rows = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'c')]
+    search = Search(plant, lambda workspace, _: Screen(workspace, rows))
     begun = refit(plant, [active('c', x=0.0), active('a', x=0.0)])
     _, result = search.run(refit(plant, ()), begun)
-    assert sorted(a.effect.name for a in result.fit.effects) == kept
+    assert sorted(a.effect.name for a in result.fit.effects) == names
 
 
 def test_held_out_residual_is_of_fit_without_its_cases() -> None:
@@ -506,8 +506,8 @@ def test_held_out_residual_is_of_fit_without_its_cases() -> None:
     plant = Plant({A: late, ('a', 'y'): once}, without_noise((once, 400.0)))
     x, y = effect('a', 'x', 'y').parameters
     for kind in ('amplitude', 'shape'):
-        one = dataclasses.replace(effect('a', 'x'), parameters=(x, dataclasses.replace(y, kind=kind)))
-        fit = refit(plant, [ActiveEffect(one, {'x': 0.0, 'y': 0.0})])
+        of_kind = dataclasses.replace(effect('a', 'x'), parameters=(x, dataclasses.replace(y, kind=kind)))
+        fit = refit(plant, [ActiveEffect(of_kind, {'x': 0.0, 'y': 0.0})])
         want = fit.residual if kind == 'shape' else refit(plant, ()).residual
         np.testing.assert_allclose(heldout_residual(plant, fit), want, atol=1e-3)
 
@@ -524,9 +524,9 @@ def test_the_error_of_an_unseen_gain_is_the_smaller_of_two() -> None:
     bootstrap = math.sqrt(len(piece)) * float(np.std(piece))
     assert gain.gain == pytest.approx(piece.sum())
     assert gain.error == pytest.approx(min(bootstrap, math.sqrt(2.0 * gain.gain)), rel=0.15)
-    far = np.zeros((6, FINE))
-    far[:, 0] = 1.0
-    plant = Plant({A: far}, without_noise((far, 400.0)))
+    spike = np.zeros((6, FINE))
+    spike[:, 0] = 1.0
+    plant = Plant({A: spike}, without_noise((spike, 400.0)))
     null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
     fit = dataclasses.replace(fit, jacobian=np.zeros_like(fit.jacobian))
     gain = heldout_gain(plant, null, fit, np.random.default_rng(0))
@@ -546,13 +546,13 @@ def test_a_score_is_the_chi_square_that_a_candidate_would_gain() -> None:
     shown = pictures(A, ('b', 'x'), ('b', 'y'), ('c', 'x'), ('d', 'x'))
     shown['d', 'x'] = 1e-6 * SIGMA * shown['d', 'x']
     plant = Plant(shown, 2e-4 * shown[A] - 1e-4 * shown['b', 'y'] - 1e-4 * shown['c', 'x'] + noise())
-    found = [
+    rows = [
         (candidate('a', 'x'), [[shown[A]]]),
         (candidate('b', 'x', 'y'), [[shown['b', 'x']], [shown['b', 'y']]]),
         (candidate('c', 'x', least=0.0), [[shown['c', 'x']]]),
         (candidate('d', 'x'), [[shown['d', 'x']]]),
     ]
-    screen = Screen(plant, found)
+    screen = Screen(plant, rows)
     # d changes the readings by less than a thousandth of sigma in all.
     assert [c.effect.name for c in screen.candidates] == ['a', 'b', 'c']
     data = plant.measured[0].ravel() / SIGMA
@@ -567,11 +567,11 @@ def test_a_score_is_the_chi_square_that_a_candidate_would_gain() -> None:
             matrix = columns(shown, *known)
             residual = data - matrix @ np.linalg.lstsq(matrix, data, rcond=None)[0]
             scores = {s.candidate.effect.name: s for s in screen.score(residual, matrix)}
-        for name, own in (('a', [A]), ('b', [('b', 'x'), ('b', 'y')])):
-            gain = rss(*known) - rss(*known, *own)
+        for name, keys in (('a', [A]), ('b', [('b', 'x'), ('b', 'y')])):
+            gain = rss(*known) - rss(*known, *keys)
             assert scores[name].gain == pytest.approx(gain, rel=1e-3)
-            assert scores[name].dof == len(own)
-            assert scores[name].p == pytest.approx(1.0 - (1.0 - chi2_law.sf(gain, len(own))) ** 3, rel=1e-2)
+            assert scores[name].dof == len(keys)
+            assert scores[name].p == pytest.approx(1.0 - (1.0 - chi2_law.sf(gain, len(keys))) ** 3, rel=1e-2)
     # The size of c is negative, which its bounds do not allow.
     assert {s.candidate.effect.name: s.gain for s in screen.score(data)}['c'] == 0.0
     order = [s.gain for s in screen.score(data)]
@@ -584,12 +584,12 @@ def test_a_pair_is_scored_jointly() -> None:
     shown = pictures(A, B, ('c', 'x'), ('c', 'y'))
     shown[B] = -shown[A] + 0.05 * shown[B]
     plant = Plant(shown, 2e-3 * (shown[A] + shown[B]) + noise())
-    found = [
+    rows = [
         (candidate('c', 'x', 'y'), [[shown['c', 'x']], [shown['c', 'y']]]),
         (candidate('a', 'x'), [[shown[A]]]),
         (candidate('b', 'x', least=0.0), [[shown[B]]]),
     ]
-    screen = Screen(plant, found)
+    screen = Screen(plant, rows)
     data = plant.measured[0].ravel() / SIGMA
     (first, second, gain), *rest = screen.pairs(data, 3.0, 3)
     assert [first.candidate.effect.name, second.candidate.effect.name] in (['a', 'b'], ['b', 'a'])
@@ -599,7 +599,7 @@ def test_a_pair_is_scored_jointly() -> None:
     assert [both['a'], both['b']] == pytest.approx(c.tolist(), rel=1e-2)
     assert {s.candidate.effect.name: len(s.coefficients) for s in rest[0][:2]}['c'] == 2
     # The opposite sign of b is not allowed, whoever stands first.
-    for order in (found, found[::-1]):
+    for order in (rows, rows[::-1]):
         names = [
             {a.candidate.effect.name, b.candidate.effect.name} for a, b, _ in Screen(plant, order).pairs(-data, 3.0, 3)
         ]
@@ -702,11 +702,11 @@ class Valleys(Plant):
 
 
 @pytest.mark.parametrize(
-    ('size', 'excess', 'open_level', 'found'),
+    ('size', 'excess', 'open_level', 'expected'),
     # It stays if nothing is unknown, if nobody knows the noise, and if much remains.
     [(2e-3, 100.0, False, 40.0), (2e-3, 0.0, False, 52.0), (2e-3, 100.0, True, 52.0), (4e-3, 100.0, False, 52.0)],
 )
-def test_a_fit_in_a_side_valley_is_restarted(size: float, excess: float, open_level: bool, found: float) -> None:
+def test_a_fit_in_a_side_valley_is_restarted(size: float, excess: float, open_level: bool, expected: float) -> None:
     shape = EffectParameter('f', 'Hz', 2.0, 190.0, 0.2, '', kind='shape')
     hums = effect('a', 'x')
     hums = dataclasses.replace(hums, parameters=(*hums.parameters, shape))
@@ -716,7 +716,7 @@ def test_a_fit_in_a_side_valley_is_restarted(size: float, excess: float, open_le
     result = result_of(search, [ActiveEffect(hums, {'x': 1e-3, 'f': 52.0})])
     assert result.fit.effects[0].values['f'] == pytest.approx(52.0, abs=1.0)
     after = credible(problem_of(search, result, [HeldOut(1.0, 1.0)], nowhere(p=0.0, excess=excess)))
-    assert [a.values['f'] for a in after.fit.effects] == pytest.approx([found], abs=1.0)
+    assert [a.values['f'] for a in after.fit.effects] == pytest.approx([expected], abs=1.0)
 
 
 def test_dependence_is_chi_square_of_regressor() -> None:
@@ -751,10 +751,10 @@ def test_dependence_is_chi_square_of_regressor() -> None:
     e = residual - known[:, 0] * (known[:, 0] @ residual) / (known[:, 0] @ known[:, 0])
     row = np.zeros((6, dot.shape[1]))
     row[0] = dot[0] ** 2
-    own = row.ravel()
-    own = own - known[:, 0] * (known[:, 0] @ own) / (known[:, 0] @ known[:, 0])
+    column = row.ravel()
+    column = column - known[:, 0] * (known[:, 0] @ column) / (known[:, 0] @ known[:, 0])
     gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, known)}
-    assert gains['x1', 'dot_x^2'] == pytest.approx((e @ own) ** 2 / (own @ own), rel=1e-6)
+    assert gains['x1', 'dot_x^2'] == pytest.approx((e @ column) ** 2 / (column @ column), rel=1e-6)
     best = max(dependences(workspace, table, residual, None), key=lambda d: d.gain)
     count = len(gains)
     assert best.p == pytest.approx(1.0 - (1.0 - chi2_law.sf(best.gain, 1)) ** count, rel=0.05)
@@ -812,10 +812,10 @@ def test_experiment_separates_what_no_size_explains(monkeypatch: pytest.MonkeyPa
     idle = experiment.Proposal(experiment.Setting(), experiment.Piece('wait', ('constant:0,0,0:0.4',)))
     monkeypatch.setattr(planning, 'proposals', lambda *_: [idle, offered])
     plan = planning.plan_next(workspace, named, [alternative], experiment.Limits(seconds=0.8))
-    found = planning.suggest(workspace, named, [alternative], experiment.Limits(seconds=0.8))
+    suggestion = planning.suggest(workspace, named, [alternative], experiment.Limits(seconds=0.8))
     assert plan is not None
-    assert found is not None
-    assert found.words == 'pull'
+    assert suggestion is not None
+    assert suggestion.words == 'pull'
     short = load_rig(overrides={'link.length': 0.4})
     sigma = workspace.noise[0].innovation[:, None]
 
@@ -837,5 +837,5 @@ def test_experiment_separates_what_no_size_explains(monkeypatch: pytest.MonkeyPa
     low = float(curve(curve.deriv().roots()[0].real))
     (reported,) = plan.discriminations
     assert reported.separation == pytest.approx(low, rel=0.05)
-    assert found.separation == pytest.approx(max(reported.separation, reported.reverse), rel=1e-9)
+    assert suggestion.separation == pytest.approx(max(reported.separation, reported.reverse), rel=1e-9)
     assert planning.suggest(workspace, named, []) is None

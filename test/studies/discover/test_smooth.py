@@ -69,22 +69,22 @@ def smooth(plant: Table, variables: Mapping[str, Sequence[FloatArray]] | None = 
 
 def test_smooth_remainder_is_function_of_its_variable() -> None:
     plant = Table(1, 1.0)
-    found = psd_deflection.discover_in(plant)
-    remainder = found.tree()['remainder']
+    discovery = psd_deflection.discover_in(plant)
+    remainder = discovery.tree()['remainder']
     assert remainder['depends_on'] == ['along']
     # Little but the noise remains of readings that the function has not seen; those at the ends are the worst.
-    assert remainder['heldout'] < 2.5 * NOISE < 0.5 * found.gap_heldout_after
-    assert found.verdict == 'unknown_effect'
-    assert 'a smooth function of along that has no name' in found.unknown[-1].signature
-    assert found.remainder is not None
-    function = found.remainder.function
+    assert remainder['heldout'] < 2.5 * NOISE < 0.5 * discovery.gap_heldout_after
+    assert discovery.verdict == 'unknown_effect'
+    assert 'a smooth function of along that has no name' in discovery.unknown[-1].signature
+    assert discovery.remainder is not None
+    function = discovery.remainder.function
     assert function is not None
-    assert found.remainder.rms == pytest.approx(math.sqrt(function.before**2 - function.heldout**2))
+    assert discovery.remainder.rms == pytest.approx(math.sqrt(function.before**2 - function.heldout**2))
     # It is the waves, but for what offset and slope take.
     free = np.column_stack([np.ones(30), plant.along, np.sin(9.0 * plant.along)])
     residual = function.tables[0][0]
     assert np.std(residual - free @ np.linalg.lstsq(free, residual, rcond=None)[0]) < NOISE
-    assert 'a smooth function of along' in found.report()
+    assert 'a smooth function of along' in discovery.report()
 
 
 @pytest.mark.slow
@@ -166,10 +166,10 @@ def test_shared_sizes_leave_the_likelihood_once() -> None:
         return -float(multivariate_normal(cov=across.T @ full @ across).logpdf(across.T @ values))
 
     first, second = np.log([[0.5, 1.0, 0.7], [0.3, 2.0, 1.5]]), np.log([[0.2, 1.5, 0.4], [0.9, 0.7, 0.9]])
-    (one, _), (other, gradient) = (
+    (value, _), (other, gradient) = (
         smoothing.negative_log_likelihood(s.ravel(), parts, ('place',)) for s in (first, second)
     )
-    assert other - one == pytest.approx(exact(second) - exact(first))
+    assert other - value == pytest.approx(exact(second) - exact(first))
     steps = 1e-5 * np.eye(6).reshape(6, 2, 3)
     numeric = [(exact(second + h) - exact(second - h)) / 2e-5 for h in steps]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
@@ -234,26 +234,26 @@ def test_twelve_small_terms_are_predicted_as_by_bic_or_better(seed: int) -> None
     sizes[rng.permutation(TERMS)[:12]] = rng.uniform(1.5, 3.0, 12) * rng.choice([-1, 1], 12) / np.sqrt(80 * 1.5)
     full = Small(sizes, 440, seed)
     observed, new = full.cut(slice(0, 40)), full.cut(slice(40, 440))
-    found = psd_deflection.discover_in(observed)
+    discovery = psd_deflection.discover_in(observed)
 
     def wrong(model: Model) -> float:
         return float(np.sqrt(np.mean((new.simulate(model)[0] - new.truth) ** 2)))
 
-    assert np.hypot(1.0, wrong(found.predictive)) <= 1.1 * np.hypot(1.0, wrong(forward_backward(observed)))
-    assert wrong(found.predictive) < wrong({e.name: e.values for e in found.effects})
-    np.testing.assert_array_equal(found.predict(new)[0], new.simulate(found.predictive)[0])
+    assert np.hypot(1.0, wrong(discovery.predictive)) <= 1.1 * np.hypot(1.0, wrong(forward_backward(observed)))
+    assert wrong(discovery.predictive) < wrong({e.name: e.values for e in discovery.effects})
+    np.testing.assert_array_equal(discovery.predict(new)[0], new.simulate(discovery.predictive)[0])
 
 
 def test_what_small_terms_do_together_is_reported_everywhere() -> None:
     rng = np.random.default_rng(5)
-    found = psd_deflection.discover_in(Small(0.22 * rng.standard_normal(TERMS), 60, 5))
-    tree = json.loads(found.json())
-    assert (found.verdict, tree['remains']) == ('unknown_effect', True)
+    discovery = psd_deflection.discover_in(Small(0.22 * rng.standard_normal(TERMS), 60, 5))
+    tree = json.loads(discovery.json())
+    assert (discovery.verdict, tree['remains']) == ('unknown_effect', True)
     message = tree['predictive']
     assert message['nested']
     assert message['unseen'] < message['unseen_named']
-    assert f'{len(message["terms"])} small terms together lower the unseen error' in found.sentence
-    assert 'small terms together' in found.files()['report.html']
+    assert f'{len(message["terms"])} small terms together lower the unseen error' in discovery.sentence
+    assert 'small terms together' in discovery.files()['report.html']
 
 
 class Zeros(Plant):
@@ -305,8 +305,8 @@ def all_subsets(f: FloatArray, g: FloatArray, energy: float, size: float) -> tup
     return sizes / total, weights / total
 
 
-@pytest.mark.parametrize(('slabs', 'near'), [(predictive.SLABS, 0.06), (np.array([1.0]), 0.02)])
-def test_averages_are_those_over_all_subsets(slabs: FloatArray, near: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(('slabs', 'atol'), [(predictive.SLABS, 0.06), (np.array([1.0]), 0.02)])
+def test_averages_are_those_over_all_subsets(slabs: FloatArray, atol: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predictive, 'WALK', (1000, 8, 1000))
     monkeypatch.setattr(predictive, 'SLABS', slabs)
     rng = np.random.default_rng(3)
@@ -316,8 +316,8 @@ def test_averages_are_those_over_all_subsets(slabs: FloatArray, near: float, mon
     given = (x.T @ x, x.T @ y, float(y @ y), 80.0)
     sizes, weights = predictive.averaged(*given, rng)
     want, likely = all_subsets(*given)
-    np.testing.assert_allclose(weights, likely, atol=near)
-    np.testing.assert_allclose(sizes, want, atol=0.3 * near)
+    np.testing.assert_allclose(weights, likely, atol=atol)
+    np.testing.assert_allclose(sizes, want, atol=0.3 * atol)
     # What is explained already, and nothing to explain.
     f = np.diag([80.0, 80.0 * 1e-7])
     sizes, weights = predictive.averaged(f, np.array([40.0, 1e-9]), 80.0, 80.0, rng)
@@ -349,12 +349,12 @@ def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool, o
     x, shape = a.effect.parameters
     both = (x, dataclasses.replace(shape, kind='shape'))
     fit = refit(plant, [ActiveEffect(dataclasses.replace(a.effect, parameters=both), a.values)])
-    found = [
+    rows = [
         (candidate('b', 'x', 'y'), [[1e-3 * shown['b', 'x']], [1e-3 * shown['b', 'y']]]),
         (candidate('c', 'x', least=0.0), [[1e-3 * shown['c', 'x']]]),
         (candidate('d', 'x'), [[1e-3 * shown['d', 'x']]]),
     ]
-    got = predictive.predictive_of(plant, fit, Screen(plant, found), np.random.default_rng(0))
+    got = predictive.predictive_of(plant, fit, Screen(plant, rows), np.random.default_rng(0))
     assert got is not None
     table, y = columns(shown, *names) * SIGMA, plant.measured[0].ravel()
     fold = np.tile(plant.case[0] % 4, 6)

@@ -52,15 +52,15 @@ A, B, C = ('a', 'x'), ('b', 'x'), ('c', 'x')
 
 def searching(plant: Plant, shown: Pictures, names: Sequence[str], message: list[str] | None = None) -> Search:
     """A search among effects of one size each, with the pictures that the plant shows."""
-    found: list[tuple[Candidate, list[list[FloatArray]]]] = [
+    rows: list[tuple[Candidate, list[list[FloatArray]]]] = [
         (candidate(n, 'x'), [[1e-3 * shown[n, 'x']]]) for n in names
     ]
-    return Search(plant, lambda ws, _: Screen(ws, found), (message if message is not None else []).append)
+    return Search(plant, lambda ws, _: Screen(ws, rows), (message if message is not None else []).append)
 
 
-def across(picture: FloatArray, *others: FloatArray) -> FloatArray:
+def across(picture: FloatArray, *pictures: FloatArray) -> FloatArray:
     """What of a picture is not in the others, at the first one's length."""
-    matrix = np.stack([o.ravel() for o in others], axis=1)
+    matrix = np.stack([o.ravel() for o in pictures], axis=1)
     rest = picture.ravel() - matrix @ np.linalg.lstsq(matrix, picture.ravel(), rcond=None)[0]
     return np.asarray(rest.reshape(picture.shape) * np.linalg.norm(picture) / np.linalg.norm(rest))
 
@@ -127,12 +127,12 @@ def test_effects_beside_late_loads_are_simulated_anew(late: float, again: bool) 
     shown = pictures(('load_delay', 'x'), B, C)
     rest = 20.0 * 6 * FINE
     plant = Plant(shown, without_noise((shown['load_delay', 'x'], late * rest), (shown[C], rest)) + noise())
-    found = [(candidate(n, 'x'), [[1e-3 * shown[n, 'x']]]) for n in ('load_delay', 'b')]
+    rows = [(candidate(n, 'x'), [[1e-3 * shown[n, 'x']]]) for n in ('load_delay', 'b')]
     beside: list[Fit | None] = []
 
     def screen(ws: Comparison, fit: Fit | None) -> Screen:
         beside.append(fit)
-        return Screen(ws, found)
+        return Screen(ws, rows)
 
     search = Search(plant, screen)
     null = refit(plant, ())
@@ -157,8 +157,8 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
             return super().simulate(effects)
 
     plant = Far(shown, without_noise((shown['sample_rate', 'error'], 50.0 * 6 * FINE)))
-    found = [(candidate('sample_rate', 'error'), [[1e-3 * shown['sample_rate', 'error']]])]
-    search = Search(plant, lambda ws, _: Screen(ws, found))
+    rows = [(candidate('sample_rate', 'error'), [[1e-3 * shown['sample_rate', 'error']]])]
+    search = Search(plant, lambda ws, _: Screen(ws, rows))
     null = refit(plant, ())
     first = mistake(search, null, search.screen.score(null.residual))
     assert named(first) == ['sample_rate']
@@ -174,16 +174,16 @@ def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) ->
     # The fit of no effect was before the search; after the first effect there is more than one simulation.
     for budget, effects in ((0, 0), (1, 1)):
         monkeypatch.setattr(plant, 'budget', budget)
-        found = ran(searching(plant, shown, names))
-        assert len(found.fit.effects) == effects
-        (limit,) = found.limits
+        result = ran(searching(plant, shown, names))
+        assert len(result.fit.effects) == effects
+        (limit,) = result.limits
         assert limit.limit == f'{budget * max(effects, 1)} simulations for {effects} effect{"s" * (effects != 1)}'
-        beyond = sorted(set(names) - set(named(found.fit)))
-        assert limit.further.startswith(f'{len(beyond)} more term')
-        assert all(name in limit.further.split('(')[1].split(')')[0] for name in beyond)
-        left, of = (float(words.split()[0]) for words in limit.further.split('be ')[-1].split(' instead of '))
+        missing = sorted(set(names) - set(named(result.fit)))
+        assert limit.further.startswith(f'{len(missing)} more term')
+        assert all(name in limit.further.split('(')[1].split(')')[0] for name in missing)
+        remaining, of = (float(words.split()[0]) for words in limit.further.split('be ')[-1].split(' instead of '))
         # Six effects of 900 in 14400 values.
-        assert left < 0.9 * of
+        assert remaining < 0.9 * of
 
 
 @pytest.mark.parametrize(
@@ -197,8 +197,8 @@ def test_what_explains_six_tenths_is_tried_instead(gain: float, share: float, tr
     shown[B] = math.sqrt(share) * shown[A] + math.sqrt(1.0 - share) * across(shown[B], shown[A])
     plant = Plant(shown, without_noise((shown[A], gain)))
     null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
-    found = searching(plant, shown, 'ab').alternatives(null, fit, 0, null.chi2 - fit.chi2)
-    assert [named(f) for f in found] == tried
+    fits = searching(plant, shown, 'ab').alternatives(null, fit, 0, null.chi2 - fit.chi2)
+    assert [named(f) for f in fits] == tried
 
 
 def test_a_small_share_counts_beside_many_effects() -> None:
@@ -206,8 +206,8 @@ def test_a_small_share_counts_beside_many_effects() -> None:
     sizes = [9e5, 3e5, 1e5, 4e4, *[3000.0] * 8]
     shown = pictures(*((n, 'x') for n in names))
     measured = without_noise(*((shown[n, 'x'], size) for n, size in zip(names, sizes, strict=True))) + noise()
-    found = ran(searching(Plant(shown, measured), shown, names))
-    assert (named(found.fit), found.limits) == (list(names), ())
+    result = ran(searching(Plant(shown, measured), shown, names))
+    assert (named(result.fit), result.limits) == (list(names), ())
     # The library lacks so much that the rest does not leave next to nothing.
     few = ran(searching(Plant(shown, measured), shown, names[:7]))
     assert named(few.fit) == list('abcd')
@@ -218,9 +218,9 @@ def test_stand_in_effect_is_reported_and_not_added() -> None:
     shown = pictures(A, B, C)
     # The library lacks c, which explains much more than b.
     plant = Plant(shown, without_noise((shown[A], 9e5), (shown[B], 4000.0), (shown[C], 60000.0)) + noise())
-    found = ran(searching(plant, shown, 'ab'))
-    assert named(found.fit) == ['a']
-    (limit,) = found.limits
+    result = ran(searching(plant, shown, 'ab'))
+    assert named(result.fit) == ['a']
+    (limit,) = result.limits
     assert limit.limit.startswith('b beside 1 effect explains less than 20% of what remains')
     assert limit.further.startswith('1 more term (b) would pass')
     full = ran(searching(plant, shown, 'abc'))
@@ -260,9 +260,9 @@ def test_the_better_of_two_alike_stays_the_other_is_listed() -> None:
     assert other.chi2 == pytest.approx(want, rel=1e-6)
     # From the worse one it swaps to the better.
     null, worse = refit(plant, ()), refit(plant, [active('b', x=0.0)])
-    better, others = search.swap(null, worse)
+    better, fits = search.swap(null, worse)
     assert named(better) == ['a']
-    assert [named(f) for f in others[0]] == [['b']]
+    assert [named(f) for f in fits[0]] == [['b']]
     assert search.library_p(9.0, 1) == pytest.approx(1.0 - (1.0 - chi2_law.sf(9.0, 1)) ** 2)
     assert search.library_p(-1.0, 1) == 1.0
     assert search.penalty == pytest.approx(math.log(size * 4 / 20))
@@ -299,25 +299,25 @@ def test_cells_are_normal_deviates_of_their_energy(explains: bool) -> None:
     residual[1, 350:400] += 1.2
     explained = 400.0 * noise(11).ravel() / SIGMA if explains else None
     plant = Plant({}, noise())
-    found = localise(plant, residual.ravel(), None, np.random.default_rng(1), explained=explained)
+    located = localise(plant, residual.ravel(), None, np.random.default_rng(1), explained=explained)
     z, excess = energy_of(residual.ravel(), explained)
     # The cube root of a chi-square is normal but for its lowest values.
     inside = (z > -1.0) & (z < 5.0)
-    assert np.abs(found.map - z)[inside].max() < 0.25
+    assert np.abs(located.map - z)[inside].max() < 0.25
     order = np.argsort(-z, axis=None)
     first = [np.unravel_index(int(i), z.shape) for i in order[:2]]
-    for cell, (case, c, b) in zip(found.cells[:2], first, strict=True):
+    for cell, (case, c, b) in zip(located.cells[:2], first, strict=True):
         assert (cell.channel, cell.recording) == (CHANNELS[int(c)], 0)
         assert cell.when == pytest.approx((0.2 * case, 0.2 * (case + 1)))
         assert cell.band == (EDGES[int(b)], min(EDGES[int(b) + 1], 125.0))
         assert cell.energy == pytest.approx(excess[case, c, b], rel=1e-6)
-        assert cell.statistic == found.map[case, c, b]
+        assert cell.statistic == located.map[case, c, b]
         assert cell.p < 0.01
-    assert len(found.cells) == 12
-    assert all(a.statistic >= b.statistic for a, b in zip(found.cells, found.cells[1:], strict=False))
-    np.testing.assert_allclose(found.spans, [(0, 0.2 * k, 0.2 * (k + 1)) for k in range(8)])
-    significant = [c for c in found.cells if c.p < 0.01]
-    assert found.excess == pytest.approx(sum(c.energy for c in significant), rel=1e-6)
+    assert len(located.cells) == 12
+    assert all(a.statistic >= b.statistic for a, b in zip(located.cells, located.cells[1:], strict=False))
+    np.testing.assert_allclose(located.spans, [(0, 0.2 * k, 0.2 * (k + 1)) for k in range(8)])
+    significant = [c for c in located.cells if c.p < 0.01]
+    assert located.excess == pytest.approx(sum(c.energy for c in significant), rel=1e-6)
     few = localise(plant, residual.ravel(), None, np.random.default_rng(1), limit=3)
     assert len(few.cells) == 3
 
@@ -351,13 +351,13 @@ def test_what_the_simulation_may_be_wrong_by_is_no_dependence() -> None:
     plain = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, None)}
     assert len(plain) == 6 * 27
     for size in (100.0, 1000.0):
-        beyond = {
+        gains = {
             (d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, None, size * explained)
         }
         for (channel, name), gain in plain.items():
-            own = workspace.split(size * explained)[0][CHANNELS.index(channel)]
-            root = max(math.sqrt(gain) - 0.002 * float(np.linalg.norm(own)), 0.0)
-            assert beyond[channel, name] == pytest.approx(root**2, rel=1e-6, abs=1e-9)
+            rows = workspace.split(size * explained)[0][CHANNELS.index(channel)]
+            root = max(math.sqrt(gain) - 0.002 * float(np.linalg.norm(rows)), 0.0)
+            assert gains[channel, name] == pytest.approx(root**2, rel=1e-6, abs=1e-9)
 
 
 def amplitudes(*kinds: tuple[str, str, float], same: bool = False, finite: bool = False) -> Fit:
@@ -404,9 +404,9 @@ def test_three_sizes_are_tied_where_no_two_are() -> None:
     physics = Physics.of(RIG)
     two = [('x', '', 0.03), ('y', '', 0.0303)]
     assert coincidences(amplitudes(*two), physics)[0].odds < 40.0
-    others = [('u', '', 0.4), ('v', '', 2.0), ('w', '', 8.0)]
-    assert coincidences(amplitudes(*two, *others), physics) == []
-    (tie,) = coincidences(amplitudes(*two, ('z', '', -0.0297), *others), physics)
+    more = [('u', '', 0.4), ('v', '', 2.0), ('w', '', 8.0)]
+    assert coincidences(amplitudes(*two, *more), physics) == []
+    (tie,) = coincidences(amplitudes(*two, ('z', '', -0.0297), *more), physics)
     assert [name for _, name in tie.members] == ['x', 'y', 'z']
     assert 20.0 < tie.odds < 200.0
 
@@ -437,31 +437,31 @@ def test_recording_of_few_samples_is_excluded_alone() -> None:
     volts = full.volts.copy()
     volts[60:] = np.nan
     poor = dataclasses.replace(full, volts=volts)
-    (one, both) = (movement_sums(o, ()) for o in ([full], [poor, full]))
-    assert both.squared == one.squared > 0.0
-    np.testing.assert_array_equal(both.cross, one.cross)
-    np.testing.assert_array_equal(both.load_products, one.load_products)
+    (sums, both) = (movement_sums(o, ()) for o in ([full], [poor, full]))
+    assert both.squared == sums.squared > 0.0
+    np.testing.assert_array_equal(both.cross, sums.cross)
+    np.testing.assert_array_equal(both.load_products, sums.load_products)
     volts[60:80] = full.volts[60:80]
-    assert movement_sums([dataclasses.replace(full, volts=volts), full], ()).squared > one.squared
+    assert movement_sums([dataclasses.replace(full, volts=volts), full], ()).squared > sums.squared
     # Sums over the blocks of what the dots moved about their mean, m^2.
     dots = full.volts[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
     blocks = dots.reshape(60, 20, 4).mean(axis=1)
-    assert one.squared == pytest.approx(float(((blocks - blocks.mean(axis=0)) ** 2).sum()))
+    assert sums.squared == pytest.approx(float(((blocks - blocks.mean(axis=0)) ** 2).sum()))
     noise_of_dots = float(np.mean(RIG.noises[:, :2] ** 2)) * RIG.amplifier.sensitivity**2
-    assert one.noise == pytest.approx(noise_of_dots / 20.0)
+    assert sums.noise == pytest.approx(noise_of_dots / 20.0)
     # A load moves as much as it does alone, in proportion.
     for k in range(3):
         only = np.zeros_like(full.loads)
         only[:, k] = full.loads[:, k]
         moved = ForwardModel(RIG, []).run(only).dots.T.reshape(60, 20, 4).mean(axis=1)
         moved -= moved.mean(axis=0)
-        assert one.load_products[k, k] == pytest.approx(float((moved**2).sum()), rel=1e-2)
+        assert sums.load_products[k, k] == pytest.approx(float((moved**2).sum()), rel=1e-2)
         np.testing.assert_allclose(
-            np.diag(one.cross[k]).sum(), float((moved * (blocks - blocks.mean(axis=0))).sum()), rtol=2e-2
+            np.diag(sums.cross[k]).sum(), float((moved * (blocks - blocks.mean(axis=0))).sum()), rtol=2e-2
         )
-    left, sizes = load_sizes(one, Wiring.from_rig(RIG))
+    residual, sizes = load_sizes(sums, Wiring.from_rig(RIG))
     assert sizes == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
-    assert left < 1e-3 * one.squared
+    assert residual < 1e-3 * sums.squared
     assert noise_energy([full, full]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
 
 
@@ -478,18 +478,18 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_alternative: bool) -
     )
     null = refit(search.workspace, ())
     result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], alternatives=[[other]])
-    (found,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
-    assert found.equivalent == ()
-    assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.fitted_alternatives] == [
+    (named,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
+    assert named.equivalent == ()
+    assert [(r.active.effect.name, r.delta_bic, r.fit) for r in named.fitted_alternatives] == [
         ('b', loss + 3.0, other)
     ] * is_alternative
     if is_alternative:
-        assert found.fitted_alternatives[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
+        assert named.fitted_alternatives[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
     # One that ran into its bound is none.
     stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))
     without = dataclasses.replace(result, alternatives=[[stopped]])
-    (found,) = alternatives(problem_of(search, without, [HeldOut(9.0, 1.0)])).named
-    assert found.fitted_alternatives == ()
+    (named,) = alternatives(problem_of(search, without, [HeldOut(9.0, 1.0)])).named
+    assert named.fitted_alternatives == ()
 
 
 def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:

@@ -21,7 +21,7 @@ def mode(frequency: float = 14.0, damping: float = 0.02, *, sd: float = 1e-4, da
     return Mode(frequency, sd, damping, damping_sd, 1e-3)
 
 
-def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
+def of_axes(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
     """Seen in ``stretches`` of half a second, one each second; 500 samples a second."""
     places = tuple((500 * i + 50, 500 * i + 300) for i in range(stretches))
     x, y, twist = (
@@ -61,7 +61,7 @@ def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
     ],
 )
 def test_why_the_rig_file_does_not_get_a_mode(x: tuple[Mode, ...], y: tuple[Mode, ...], why: str | None) -> None:
-    answer = found(x, y, ())
+    answer = of_axes(x, y, ())
     message = answer.withheld_reason('bending')
     assert (message is None) is (why is None)
     assert why is None or (message is not None and why in message)
@@ -73,13 +73,13 @@ def test_why_the_rig_file_does_not_get_a_mode(x: tuple[Mode, ...], y: tuple[Mode
 def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
     less, more = mode(14.00000012, 0.0200000123, sd=2e-3), mode(14.01234567890, 0.0212345678, sd=1e-3)
     rounded = {'dynamics.bending_frequency': 14.012346, 'dynamics.bending_damping_ratio': 0.0212346}
-    assert found((less,), (more,), ()).values == rounded
-    assert found((more,), (less,), ()).values == rounded
+    assert of_axes((less,), (more,), ()).values == rounded
+    assert of_axes((more,), (less,), ()).values == rounded
     # Sure is the share of the frequency.
     assert (
-        found((mode(14.0, sd=1.0e-3),), (mode(14.05, sd=1.002e-3),), ()).values['dynamics.bending_frequency'] == 14.05
+        of_axes((mode(14.0, sd=1.0e-3),), (mode(14.05, sd=1.002e-3),), ()).values['dynamics.bending_frequency'] == 14.05
     )
-    twist = found((), (), (mode(21.0), mode(3.0))).values
+    twist = of_axes((), (), (mode(21.0), mode(3.0))).values
     assert twist == {'dynamics.torsion_frequency': 21.0, 'dynamics.torsion_damping_ratio': 0.02}
 
 
@@ -90,7 +90,7 @@ def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str
     MZV leaves at most 5 % to 0.71 Hz from 14 Hz.
     """
     modes = (mode(13.7), mode(13.4, sd=sd), mode(14.6, 0.05))
-    answer = found((*modes, mode(50.0, sd=1.0)), (mode(sd=0.3),), ())
+    answer = of_axes((*modes, mode(50.0, sd=1.0)), (mode(sd=0.3),), ())
     both = answer.shaper_of(0)
     middle = shaper(name, 14.0, 0.02)
     assert both is not None
@@ -104,12 +104,12 @@ def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str
 def test_a_mode_in_words() -> None:
     x = Mode(14.0, 0.01, 0.02, 0.001, 12.34e-6)
     twist = Mode(21.0, 0.02, 0.03, 0.001, math.radians(0.0125))
-    answer = found((x, mode(40.0)), (), (twist,))
+    answer = of_axes((x, mode(40.0)), (), (twist,))
     words = ('14.000 ± 0.020', '0.0200 ± 0.0020', '12.3 µm', '1 ring-down')
     assert answer.mode_words(0, x) == words
     assert answer.mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
-    assert found((x,), (), (), stretches=2).mode_words(0, x)[3] == '2 ring-downs'
-    assert found((x,), (), (), stretches=0).mode_words(0, x)[3] == 'the spectrum in operation'
+    assert of_axes((x,), (), (), stretches=2).mode_words(0, x)[3] == '2 ring-downs'
+    assert of_axes((x,), (), (), stretches=0).mode_words(0, x)[3] == 'the spectrum in operation'
     best = answer.shaper_of(0)
     assert best is not None
     impulses = ', '.join(f'{s:.4f} at {1000.0 * t:.1f} ms' for s, t in zip(best.sizes, best.times, strict=True))
@@ -128,7 +128,7 @@ def test_a_mode_in_words() -> None:
 
 def test_numbers_for_machines_are_in_si_units() -> None:
     x = Mode(14.0, 0.01, 0.02, 0.001, 12e-6)
-    tree = found((x,), (), (mode(21.0), mode(30.0)), stretches=2).tree()
+    tree = of_axes((x,), (), (mode(21.0), mode(30.0)), stretches=2).tree()
     assert list(tree['axes']) == ['dx', 'dy', 'theta']
     dx = tree['axes']['dx']
     assert (dx['unit'], dx['how'], dx['noise'], tree['axes']['theta']['unit']) == ('m', 'ring-down', 1e-6, 'rad')

@@ -149,16 +149,16 @@ def test_a_window_may_be_left_a_share_of_its_middle(share: float, fits: int) -> 
 def test_stretches_begin_after_a_blow_and_end_before_the_next() -> None:
     """Windows of 384 each 32; then half windows are added, to 384 + 192 k."""
     samples = blows(3500, [650, 2000])
-    found = fitting.scan_windows(samples, SAMPLE_RATE, [(16.0, 0.02)], 1e-6, 384, 32)
+    stretches = fitting.scan_windows(samples, SAMPLE_RATE, [(16.0, 0.02)], 1e-6, 384, 32)
     first = 672
     last = first + 384 + 192 * ((2000 - first - 384) // 192)
-    assert (found[0].first, found[0].last) == (first, last)
+    assert (stretches[0].first, stretches[0].last) == (first, last)
     second = last + 32 * math.ceil((2000 - last) / 32)
-    assert found[1].first == second
-    assert found[1].last == second + 384 + 192 * ((3500 - second - 384) // 192)
-    assert len(found) == 2
+    assert stretches[1].first == second
+    assert stretches[1].last == second + 384 + 192 * ((3500 - second - 384) // 192)
+    assert len(stretches) == 2
     # The end of the recording may be the end of a stretch.
-    end = found[1].last
+    end = stretches[1].last
     assert fitting.scan_windows(samples[:end], SAMPLE_RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end
     assert fitting.scan_windows(samples[: end - 1], SAMPLE_RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end - 192
 
@@ -178,14 +178,14 @@ def test_of_a_window_half_is_there_and_twelve_samples() -> None:
 @pytest.mark.slow
 def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     samples = blows(4000, [650, 2000])
-    found, modes = fitting.find_stretches(samples, samples, SAMPLE_RATE, [(15.5, 0.01)], 1e-6)
+    stretches, modes = fitting.find_stretches(samples, samples, SAMPLE_RATE, [(15.5, 0.01)], 1e-6)
     # Windows of six periods each half a period, of the frequency that is known at first.
     window, hop = round(6.0 * SAMPLE_RATE / 15.5), round(0.5 * SAMPLE_RATE / 15.5)
     firsts = [hop * math.ceil(650 / hop)]
-    assert found[0].first == firsts[0]
-    assert (found[0].last - found[0].first - window) % (window // 2) == 0
-    assert found[0].last <= 2000 < found[0].last + window // 2
-    assert 2000 <= found[1].first < 2000 + hop
+    assert stretches[0].first == firsts[0]
+    assert (stretches[0].last - stretches[0].first - window) % (window // 2) == 0
+    assert stretches[0].last <= 2000 < stretches[0].last + window // 2
+    assert 2000 <= stretches[1].first < 2000 + hop
     np.testing.assert_allclose(modes, [(16.0, 0.02)], rtol=2e-3)
     noise = 1e-6 * np.random.default_rng(8).normal(size=3000)
     assert fitting.find_stretches(noise, noise, SAMPLE_RATE, [(15.5, 0.01)], 1e-6) == ([], [(15.5, 0.01)])
@@ -196,8 +196,8 @@ def test_mode_stays_if_it_saves_30_plus_4_per_stretch(monkeypatch: pytest.Monkey
     rng = np.random.default_rng(9)
     both = [stretch(ring(t, size=s) + ring(t, 50.0, 0.01, 5e-6) + 1e-6 * rng.normal(size=800)) for s in (1e-3, -7e-4)]
     two = fitting.fit_modes(both, [(50.0, 0.01), (16.0, 0.02)])
-    one = fitting.fit_modes(both, [(16.0, 0.02)])
-    saved = float(np.sum(one.residual**2) - np.sum(two.residual**2))
+    single = fitting.fit_modes(both, [(16.0, 0.02)])
+    saved = float(np.sum(single.residual**2) - np.sum(two.residual**2))
     for factor, count in ((37.9, 1), (38.1, 2)):
         asked: list[float] = []
 
@@ -235,8 +235,8 @@ def trimmed(
     s = fitting.Stretch(samples, 100, 100 + piece * len(scatter), SAMPLE_RATE)
     residual = np.repeat(scatter, piece) * np.resize(pattern, piece * len(scatter))
     monkeypatch.setattr(fitting.Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
-    kept = fitting.trim(s, samples, SAMPLE_RATE, [(SAMPLE_RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
-    return None if kept is None else (kept.first, kept.last)
+    stretch = fitting.trim(s, samples, SAMPLE_RATE, [(SAMPLE_RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
+    return None if stretch is None else (stretch.first, stretch.last)
 
 
 def test_the_ends_that_fit_worse_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,9 +266,9 @@ def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch)
     residual = np.ones(200) * np.resize((1.0, -1.0), 200)
     residual[197] = 50.0
     monkeypatch.setattr(fitting.Stretch, 'solved', lambda self, modes: (residual, np.zeros(4)))
-    kept = fitting.trim(s, samples, SAMPLE_RATE, [(128.0, 0.02)])
-    assert kept is not None
-    assert (kept.first, kept.last) == (0, 196)
+    stretch = fitting.trim(s, samples, SAMPLE_RATE, [(128.0, 0.02)])
+    assert stretch is not None
+    assert (stretch.first, stretch.last) == (0, 196)
 
 
 def test_four_periods_are_left_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,8 +282,8 @@ def test_four_periods_are_left_at_least(monkeypatch: pytest.MonkeyPatch) -> None
 def test_the_variance_of_what_is_left_is_for_its_freedom() -> None:
     """A mode and a line of each of two stretches are eight, the mode two more."""
     s = stretch(np.zeros(20))
-    one = fitting.RingFit([(16.0, 0.02)], np.full(40, 3.0), np.eye(2))
-    assert fitting.variance_of(one, [s, s]) == pytest.approx(9.0 * 40 / 30)
+    fit = fitting.RingFit([(16.0, 0.02)], np.full(40, 3.0), np.eye(2))
+    assert fitting.variance_of(fit, [s, s]) == pytest.approx(9.0 * 40 / 30)
     two = fitting.RingFit([(16.0, 0.02), (40.0, 0.02)], np.full(40, 3.0), np.eye(4))
     assert fitting.variance_of(two, [s, s]) == pytest.approx(9.0 * 40 / 24)
     assert fitting.variance_of(two, [s] * 5) == pytest.approx(9.0 * 40 / 6)
@@ -303,12 +303,12 @@ def test_the_variance_at_a_mode_is_of_its_density(
     modes = [(frequency * 1.01, 0.02), *[(frequency * 0.72, 0.02)] * (close - 1), (frequency * 1.31, 0.02)]
     fit = fitting.RingFit(modes, residual, np.eye(2 * len(modes)))
     f, p = periodogram(residual, rate)
-    near = [v for k, v in zip(f, p, strict=True) if abs(k - frequency) < half_width]
-    assert len(near) == count
+    lines = [v for k, v in zip(f, p, strict=True) if abs(k - frequency) < half_width]
+    assert len(lines) == count
     s = stretch(np.zeros(20))
     for stretches in (1, 2, 3, 4, 6):
         free = max(2 * count - 2 * close * (stretches + 1), 2)
-        expected = sum(near) * rate / free
+        expected = sum(lines) * rate / free
         # More than the mean, as this noise remembers.
         assert fitting.variance_at(fit, [s] * stretches, rate, frequency) == pytest.approx(
             max(expected, fitting.variance_of(fit, [s] * stretches)), rel=1e-9
@@ -318,24 +318,24 @@ def test_the_variance_at_a_mode_is_of_its_density(
 
 def test_the_fit_goes_through_the_samples_of_each_stretch() -> None:
     samples = blows(3500, [650, 2000])
-    found = fitting.fit_ring_downs(
+    identified = fitting.fit_ring_downs(
         samples,
         SAMPLE_RATE,
         [(16.1, 0.01)],
         [fitting.Stretch(samples, *ends, SAMPLE_RATE) for ends in ((660, 1900), (2010, 3400))],
     )
-    assert found.stretches == ((660, 1900), (2010, 3400))
-    assert found.how == 'ring-down'
-    (mode,) = found.modes
+    assert identified.stretches == ((660, 1900), (2010, 3400))
+    assert identified.how == 'ring-down'
+    (mode,) = identified.modes
     assert abs(mode.frequency - 16.0) < 4.0 * mode.frequency_sd
     assert abs(mode.damping - 0.02) < 4.0 * mode.damping_sd
-    assert found.noise == pytest.approx(1e-6, rel=0.1)
+    assert identified.noise == pytest.approx(1e-6, rel=0.1)
     # At the start of the stretches, ten samples after the blows.
     assert mode.amplitude == pytest.approx(1e-3 * math.exp(-0.02 * 2.0 * math.pi * 16.0 * 10.0 / SAMPLE_RATE), rel=2e-3)
-    assert np.isfinite(found.fitted).sum() == 1240 + 1390
+    assert np.isfinite(identified.fitted).sum() == 1240 + 1390
     for first, last, blow in ((660, 1900, 650), (2010, 3400, 2000)):
         t = (np.arange(first, last) - blow) / SAMPLE_RATE
-        np.testing.assert_allclose(found.fitted[first:last], ring(t), atol=4e-7)
+        np.testing.assert_allclose(identified.fitted[first:last], ring(t), atol=4e-7)
     # The scatter of a damped swing in white noise (Cramer and Rao), each ring-down by itself: dense slopes.
     information = np.zeros((2, 2))
     for first, last, blow in ((660, 1900, 650), (2010, 3400, 2000)):
@@ -362,10 +362,10 @@ def test_each_mode_has_its_own_scatter_and_the_loudest_is_first(monkeypatch: pyt
     monkeypatch.setattr(fitting, 'fit_trimmed', lambda *a: ([s], fit))
     monkeypatch.setattr(fitting, 'mode_sizes', lambda *a: np.array([1e-4, 1e-3]))
     monkeypatch.setattr(fitting, 'variance_at', variance)
-    found = fitting.fit_ring_downs(samples, SAMPLE_RATE, fit.modes, [s])
+    identified = fitting.fit_ring_downs(samples, SAMPLE_RATE, fit.modes, [s])
     assert asked == [16.0, 50.0]
-    assert found.noise == pytest.approx(2e-6)
-    loud, quiet = found.modes
+    assert identified.noise == pytest.approx(2e-6)
+    loud, quiet = identified.modes
     assert (loud.frequency, loud.damping, loud.amplitude) == (50.0, 0.03, 1e-3)
     assert (quiet.frequency, quiet.damping, quiet.amplitude) == (16.0, 0.02, 1e-4)
     deviations = (quiet.frequency_sd, quiet.damping_sd, loud.frequency_sd, loud.damping_sd)
@@ -375,9 +375,9 @@ def test_each_mode_has_its_own_scatter_and_the_loudest_is_first(monkeypatch: pyt
 def test_ends_that_reach_into_a_blow_are_cut_before_the_fit() -> None:
     samples = blows(3500, [650, 2000])
     reaching = [fitting.Stretch(samples, 640, 1900, SAMPLE_RATE), fitting.Stretch(samples, 2010, 3400, SAMPLE_RATE)]
-    kept, fit = fitting.fit_trimmed(samples, SAMPLE_RATE, reaching, [(16.1, 0.01)])
-    assert 650 <= kept[0].first < 1000
-    assert (kept[0].last, kept[1].first, kept[1].last) == (1900, 2010, 3400)
+    trimmed_ends, fit = fitting.fit_trimmed(samples, SAMPLE_RATE, reaching, [(16.1, 0.01)])
+    assert 650 <= trimmed_ends[0].first < 1000
+    assert (trimmed_ends[0].last, trimmed_ends[1].first, trimmed_ends[1].last) == (1900, 2010, 3400)
     np.testing.assert_allclose(fit.modes, [(16.0, 0.02)], rtol=2e-3)
     assert fit.deviation == pytest.approx(1e-6, rel=0.1)
 
@@ -386,12 +386,12 @@ def test_with_the_mode_that_was_missing_the_stretches_are_longer() -> None:
     t = times(3000)
     rng = np.random.default_rng(14)
     samples = ring(t, 15.7, 0.01, 1e-3) + ring(t, 16.3, 0.01, 6e-4, 1.0) + 1e-6 * rng.normal(size=3000)
-    found = fitting.fit_ring_downs(
+    identified = fitting.fit_ring_downs(
         samples, SAMPLE_RATE, [(16.0, 0.01)], [fitting.Stretch(samples, 0, 1000, SAMPLE_RATE)]
     )
-    assert len(found.modes) == 2
-    assert found.modes[0].amplitude > found.modes[1].amplitude
-    assert sum(last - first for first, last in found.stretches) > 2000
+    assert len(identified.modes) == 2
+    assert identified.modes[0].amplitude > identified.modes[1].amplitude
+    assert sum(last - first for first, last in identified.stretches) > 2000
 
 
 @pytest.mark.slow
@@ -433,14 +433,14 @@ def test_a_step_response_of_scipy() -> None:
     load = ((t > 0.5) & (t < 3.0)).astype(float)
     _, moved, _ = lsim(([w * w], [1.0, 2.0 * zeta * w, w * w]), load, t, interp=False)
     samples = 2e-3 * moved + np.random.default_rng(0).normal(0.0, 2e-6, len(t))
-    found = fitting.modes_of(samples, RATE)
-    assert found.how == 'ring-down'
-    (mode,) = found.modes
+    identified = fitting.modes_of(samples, RATE)
+    assert identified.how == 'ring-down'
+    (mode,) = identified.modes
     assert mode.frequency == pytest.approx(14.0, rel=1e-4)
     assert mode.damping == pytest.approx(zeta, rel=0.01)
     assert mode.amplitude == pytest.approx(2e-3, rel=0.05)
-    assert found.noise == pytest.approx(2e-6, rel=0.1)
-    starts = [first / RATE for first, _ in found.stretches]
+    assert identified.noise == pytest.approx(2e-6, rel=0.1)
+    starts = [first / RATE for first, _ in identified.stretches]
     assert any(0.5 <= s < 0.6 for s in starts)
     assert any(3.0 <= s < 3.1 for s in starts)
 
@@ -448,8 +448,8 @@ def test_a_step_response_of_scipy() -> None:
 @pytest.mark.slow
 def test_a_second_mode_is_found_and_separated() -> None:
     link = Link(((14.0, 0.02, 0.9), (46.0, 0.01, 0.1)))
-    found = fitting.modes_of(rung(link, np.random.default_rng(1)), RATE)
-    first, second = found.modes
+    identified = fitting.modes_of(rung(link, np.random.default_rng(1)), RATE)
+    first, second = identified.modes
     assert first.frequency == pytest.approx(14.0, rel=1e-4)
     assert second.frequency == pytest.approx(46.0, rel=1e-3)
     assert second.damping == pytest.approx(0.01, rel=0.05)
@@ -468,9 +468,9 @@ def test_lost_samples_and_creep_do_not_move_it() -> None:
 
 
 def test_in_operation_the_spectrum_reports_it() -> None:
-    found = fitting.modes_of(driven(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(3)), RATE)
-    assert found.how == 'operation'
-    (mode,) = found.modes
+    identified = fitting.modes_of(driven(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(3)), RATE)
+    assert identified.how == 'operation'
+    (mode,) = identified.modes
     assert abs(mode.frequency - 14.0) < 3.0 * mode.frequency_sd < 0.3
     assert abs(mode.damping - 0.02) < 3.0 * mode.damping_sd < 0.02
     assert mode.amplitude == pytest.approx(200e-6, rel=0.3)
@@ -478,9 +478,9 @@ def test_in_operation_the_spectrum_reports_it() -> None:
 
 def test_noise_has_no_mode() -> None:
     for seed in range(3):
-        found = fitting.modes_of(np.random.default_rng(seed).normal(0.0, 2e-6, 5000), RATE)
-        assert found.modes == ()
-        assert found.how == 'none'
+        identified = fitting.modes_of(np.random.default_rng(seed).normal(0.0, 2e-6, 5000), RATE)
+        assert identified.modes == ()
+        assert identified.how == 'none'
 
 
 HALF_KHZ = 500.0
@@ -511,14 +511,14 @@ def test_each_sample_has_its_place_on_an_even_grid(monkeypatch: pytest.MonkeyPat
         converter=SimpleNamespace(sample_rate_hz=HALF_KHZ), estimator=SimpleNamespace(solver='any')
     )
     opened: Any = SimpleNamespace(recording=recording, rig=rig)
-    found = read_identify(opened)
+    problem = read_identify(opened)
     expected = np.full((10, 3), math.nan)
     for place, row in ((0, 0), (1, 1), (5, 3), (9, 5)):
         expected[place] = pose[row]
-    np.testing.assert_array_equal(found.poses, expected)
-    assert found.rate == HALF_KHZ
-    assert found.opened is opened
-    assert [(m.t, m.text) for m in found.marks] == [(1.5, 'knock')]
+    np.testing.assert_array_equal(problem.poses, expected)
+    assert problem.rate == HALF_KHZ
+    assert problem.opened is opened
+    assert [(m.t, m.text) for m in problem.marks] == [(1.5, 'knock')]
 
 
 def swing(frequency: float, n: int, rate: float = HALF_KHZ, zeta: float = 0.02, size: float = 1e-3) -> FloatArray:
@@ -530,10 +530,10 @@ def test_a_hundred_samples_are_enough() -> None:
     """A second of a mode of 12.5 Hz; one sample less is too little."""
     samples = swing(12.5, 101, 100.0) + 1e-6 * np.random.default_rng(1).normal(size=101)
     samples[50] = math.nan
-    found = fitting.modes_of(samples, 100.0)
-    assert found.how == 'ring-down'
-    assert found.modes[0].frequency == pytest.approx(12.5, rel=1e-2)
+    identified = fitting.modes_of(samples, 100.0)
+    assert identified.how == 'ring-down'
+    assert identified.modes[0].frequency == pytest.approx(12.5, rel=1e-2)
     samples[10] = math.nan
-    found = fitting.modes_of(samples, 100.0)
-    assert (found.how, found.modes, found.stretches) == ('none', (), ())
-    assert math.isnan(found.noise)
+    identified = fitting.modes_of(samples, 100.0)
+    assert (identified.how, identified.modes, identified.stretches) == ('none', (), ())
+    assert math.isnan(identified.noise)

@@ -88,8 +88,8 @@ def test_white_noise_below_a_link_that_is_driven_keeps_its_size(peaks: list[floa
         w = 2.0 * np.pi * peak / RATE
         pole = np.exp(-0.02 * w + 1j * w)
         samples += lfilter([2e-6], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.normal(size=20_000))
-    found = spectra.coloured_noise(samples, RATE, peaks)
-    density = found.density(np.array([120.0, 300.0, 450.0]), RATE)
+    noise = spectra.coloured_noise(samples, RATE, peaks)
+    density = noise.density(np.array([120.0, 300.0, 450.0]), RATE)
     np.testing.assert_allclose(density, 2.0 * 2e-6**2 / RATE, rtol=0.12)
 
 
@@ -104,9 +104,9 @@ def test_coloured_noise_has_autoregressive_density() -> None:
 def test_band_above_fast_mode_has_no_random_walk() -> None:
     """The whole spectrum then stands for the noise."""
     samples = np.random.default_rng(9).normal(0.0, 2e-6, 20_000)
-    found = spectra.coloured_noise(samples, RATE, [185.0])
-    assert found.random_walk == 0.0
-    assert found.white == pytest.approx(2.0 * 2e-6**2 / RATE, rel=0.05)
+    noise = spectra.coloured_noise(samples, RATE, [185.0])
+    assert noise.random_walk == 0.0
+    assert noise.white == pytest.approx(2.0 * 2e-6**2 / RATE, rel=0.05)
 
 
 @pytest.mark.parametrize('frequency', [14.0, 14.05, 0.125])
@@ -178,10 +178,10 @@ def test_mode_is_likeliest_with_scatter_of_likelihood(
         bounds=[(1e-3, 1e3), (13, 15), (5e-3, 0.1), (-5, 5), (1e-6, 1e3)],
     )
     best = minimize(loss, best.x, method='Nelder-Mead', options={'xatol': 1e-9, 'fatol': 1e-12, 'maxfev': 4000})
-    found = spectra.mode_in_operation(samples, DRIVEN_RATE, guess)
-    assert found is not None
-    assert found.frequency == pytest.approx(best.x[1], rel=3e-6)
-    assert found.damping == pytest.approx(best.x[2], rel=3e-4)
+    mode = spectra.mode_in_operation(samples, DRIVEN_RATE, guess)
+    assert mode is not None
+    assert mode.frequency == pytest.approx(best.x[1], rel=3e-6)
+    assert mode.damping == pytest.approx(best.x[2], rel=3e-4)
     slopes = []
     for i, step in enumerate(1e-5 * np.maximum(np.abs(best.x), 1e-2)):
         more = np.array(best.x)
@@ -190,8 +190,8 @@ def test_mode_is_likeliest_with_scatter_of_likelihood(
     information = np.array(slopes) @ np.array(slopes).T
     information[3, 3] += 1.0 / prior**2
     deviations = np.sqrt(np.linalg.inv(information).diagonal())
-    assert found.frequency_sd == pytest.approx(deviations[1], rel=2e-3)
-    assert found.damping_sd == pytest.approx(deviations[2], rel=2e-3)
+    assert mode.frequency_sd == pytest.approx(deviations[1], rel=2e-3)
+    assert mode.damping_sd == pytest.approx(deviations[2], rel=2e-3)
     # The area under what the mode adds, without the slope of what drives it.
     peak, f0, zeta = best.x[:3]
     area, _ = quad(
@@ -201,7 +201,7 @@ def test_mode_is_likeliest_with_scatter_of_likelihood(
         points=[0.9, 1.0, 1.1],
         limit=500,
     )
-    assert found.amplitude == pytest.approx(math.sqrt(1e-6 * peak * f0 * area), rel=1e-3)
+    assert mode.amplitude == pytest.approx(math.sqrt(1e-6 * peak * f0 * area), rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -82,12 +82,12 @@ def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> annotated_
     ],
 )
 def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], rotated: bool) -> None:
-    found = corrected(ROTATED if rotated else QUIET, annotated(late))
-    assert found is not None
+    correction = corrected(ROTATED if rotated else QUIET, annotated(late))
+    assert correction is not None
     wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > annotated_times.ALIKE_S}
-    assert {n.number: n.delay for n in found.notes} == pytest.approx(wrong, abs=0.002)
-    assert not found.unused.any()
-    assert np.count_nonzero(np.abs(found.loads - applied()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
+    assert {n.number: n.delay for n in correction.notes} == pytest.approx(wrong, abs=0.002)
+    assert not correction.unused.any()
+    assert np.count_nonzero(np.abs(correction.loads - applied()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_the_psd_that_agrees_with_the_loads_stays(psd: int, rows: int) -> None:
     read, loads = QUIET[max(rows, 0) :][:n].copy(), applied()[max(rows, 0) :][:n]
     in_time = read.copy()
     read[:, late] = QUIET[max(-rows, 0) :][:n, late]
-    moved, (found,) = aligned(RIG, read, loads)
-    assert (found.psd, found.rows, found.reference) == (psd, rows, 3 - psd)
+    moved, (late_psd,) = aligned(RIG, read, loads)
+    assert (late_psd.psd, late_psd.rows, late_psd.reference) == (psd, rows, 3 - psd)
     there = np.isfinite(moved).all(axis=1)
     assert np.count_nonzero(~there) == abs(rows)
     np.testing.assert_array_equal(moved[there], in_time[there])
@@ -125,9 +125,9 @@ def test_other_natural_frequencies_change_no_time() -> None:
 @pytest.mark.slow
 def test_wiring_signs_and_units_change_no_time() -> None:
     other = QUIET[:, [1, 0, 2, 4, 3, 5]] * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-    found = corrected(other, annotated(LATE) * np.array([-0.102, 0.102, 0.102]))
-    assert found is not None
-    assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.002)
+    correction = corrected(other, annotated(LATE) * np.array([-0.102, 0.102, 0.102]))
+    assert correction is not None
+    assert [n.delay for n in correction.notes] == pytest.approx(LATE, abs=0.002)
 
 
 @pytest.mark.slow
@@ -135,9 +135,9 @@ def test_lost_samples_change_no_time() -> None:
     read = QUIET.copy()
     read[np.random.default_rng(1).random(COUNT) < 0.3] = np.nan
     read[2 * DWELL - 20 : 2 * DWELL + 20] = np.nan
-    found = corrected(read, annotated(LATE))
-    assert found is not None
-    assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.003)
+    correction = corrected(read, annotated(LATE))
+    assert correction is not None
+    assert [n.delay for n in correction.notes] == pytest.approx(LATE, abs=0.003)
 
 
 @pytest.mark.parametrize(
@@ -145,13 +145,13 @@ def test_lost_samples_change_no_time() -> None:
     [((0.4,) * 6, ['load_ramp'] * 6), ((0.0, 2.0, 0.0, 0.0, 0.0, 0.0), ['load_ramp', 'load_time', *['load_ramp'] * 4])],
 )
 def test_slow_load_annotated_as_step_is_a_ramp(late: tuple[float, ...], names: list[str]) -> None:
-    found = corrected(volts(applied(0.8)), annotated(late))
-    assert found is not None
-    assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
-    assert [n.name for n in found.notes] == names
-    assert [round(n.value, 2) for n in found.notes[:2]] == [0.8, max(0.8, late[1])]
-    assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
-    assert not found.unused.any()
+    correction = corrected(volts(applied(0.8)), annotated(late))
+    assert correction is not None
+    assert [n.took for n in correction.notes] == pytest.approx([0.8] * 6, abs=0.01)
+    assert [n.name for n in correction.notes] == names
+    assert [round(n.value, 2) for n in correction.notes[:2]] == [0.8, max(0.8, late[1])]
+    assert 'as a ramp until 5.80' in correction.notes[0].words('x.csv')
+    assert not correction.unused.any()
 
 
 @pytest.mark.slow
@@ -161,12 +161,12 @@ def test_motion_that_no_ramp_describes_is_left_out() -> None:
         share = np.clip(np.arange(DWELL) / 800.0, 0.0, 1.0)
         part = slice(i * DWELL, (i + 1) * DWELL)
         smooth[part] = LEVELS[i - 1] + (LEVELS[i] - LEVELS[i - 1]) * (share**2 * (3.0 - 2.0 * share))[:, None]
-    found = corrected(volts(smooth), annotated((1.0, 2.0, 1.5, 1.0, 0.5, 2.0)))
-    assert found is not None
-    assert found.notes[0].rest_only
-    assert found.unused[DWELL + 300]
-    assert not found.unused[DWELL - 500]
-    assert 'at rest' in found.notes[0].words('x.csv')
+    correction = corrected(volts(smooth), annotated((1.0, 2.0, 1.5, 1.0, 0.5, 2.0)))
+    assert correction is not None
+    assert correction.notes[0].rest_only
+    assert correction.unused[DWELL + 300]
+    assert not correction.unused[DWELL - 500]
+    assert 'at rest' in correction.notes[0].words('x.csv')
 
 
 @pytest.mark.slow
@@ -188,15 +188,15 @@ def test_check_and_calibrate_say_the_same() -> None:
 
 @pytest.mark.slow
 def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
-    found = discover([Observation('x', RIG, ROTATED, annotated(LATE))])
-    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
-    assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=1e-4)
-    assert found.verdict == 'effects_found'
-    assert found.floors < 1.05
-    assert {f.name for f in found.setup} == {'load_time'}
-    assert not found.values
-    assert '; load 3, 3.4 s late; load 4, ' in found.sentence
-    assert found.gap_before > 100.0 * found.gap_after
+    discovery = discover([Observation('x', RIG, ROTATED, annotated(LATE))])
+    assert [e.active.label for e in discovery.effects] == ['sensor_rotation (psd 1)']
+    assert discovery.effects[0].active.values['angle'] == pytest.approx(0.02, abs=1e-4)
+    assert discovery.verdict == 'effects_found'
+    assert discovery.floors < 1.05
+    assert {f.name for f in discovery.setup} == {'load_time'}
+    assert not discovery.values
+    assert '; load 3, 3.4 s late; load 4, ' in discovery.sentence
+    assert discovery.gap_before > 100.0 * discovery.gap_after
 
 
 @pytest.mark.parametrize('moments', [0.0, 1.0, 2.0, 3.0, 4.0, 5.4, -1.0, -2.6])
@@ -235,7 +235,7 @@ def note(
 
 
 @pytest.mark.parametrize(
-    ('one', 'words'),
+    ('note', 'text'),
     [
         (
             note(3.0, 1.0, 1.75),
@@ -251,12 +251,12 @@ def note(
         ),
     ],
 )
-def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: annotated_times.CorrectedNote, words: str) -> None:
-    assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
+def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(note: annotated_times.CorrectedNote, text: str) -> None:
+    assert note.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {text}'
 
 
 @pytest.mark.parametrize(
-    ('one', 'name', 'value', 'size', 'wrong'),
+    ('note', 'name', 'value', 'size', 'wrong'),
     [
         (note(3.0, 1.0, 1.75), 'load_time', 2.0, 2.0, True),
         # As late as it took: noted when it was done.
@@ -268,9 +268,9 @@ def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: annotated_t
     ],
 )
 def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
-    one: annotated_times.CorrectedNote, name: str, value: float, size: float, wrong: bool
+    note: annotated_times.CorrectedNote, name: str, value: float, size: float, wrong: bool
 ) -> None:
-    assert (one.name, one.where, one.value, one.size, one.wrong) == (name, 'load 3', value, size, wrong)
+    assert (note.name, note.where, note.value, note.size, note.wrong) == (name, 'load 3', value, size, wrong)
 
 
 def test_ordinals_end_as_their_last_word() -> None:
@@ -330,9 +330,9 @@ def test_a_step_agrees_with_a_sample_by_sample_account(width: int, lost: float, 
         middle = sum(at * w for at, w in over.items()) / sum(over.values())
         wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
     with np.errstate(invalid='raise', divide='raise'):
-        found = [(s.at, s.size, s.first, s.last) for s in found_steps.steps_among_samples(dots, width)]
-    assert len(found) == len(wanted)
-    assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
+        steps = [(s.at, s.size, s.first, s.last) for s in found_steps.steps_among_samples(dots, width)]
+    assert len(steps) == len(wanted)
+    assert np.array(steps) == pytest.approx(np.array(wanted), rel=1e-7)
 
 
 def as_steps(*places: tuple[float, float]) -> list[DotStep]:
@@ -343,19 +343,19 @@ def cheapest(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period:
     """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
     observed = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
     factor = sum(s.size for s in steps) / sum(sizes[i] for i in observed)
-    near = [any(abs(step.at - changes[i]) * period <= 0.03 for step in steps) for i in observed]
-    own = 9.0 if sum(near) >= len(observed) / 2 else 0.0
+    close = [any(abs(step.at - changes[i]) * period <= 0.03 for step in steps) for i in observed]
+    bonus = 9.0 if sum(close) >= len(observed) / 2 else 0.0
     best: tuple[float, list[tuple[int, int]]] = (math.inf, [])
     for count in range(min(len(observed), len(steps)) + 1):
-        for some in itertools.combinations(observed, count):
-            for others in itertools.combinations(range(len(steps)), count):
-                pairs = list(zip(some, others, strict=True))
+        for notes in itertools.combinations(observed, count):
+            for indices in itertools.combinations(range(len(steps)), count):
+                pairs = list(zip(notes, indices, strict=True))
                 cost = 9.0 * (len(observed) - count) + 4.0 * (len(steps) - count)
                 for i, j in pairs:
                     away = abs(steps[j].at - changes[i]) * period
                     unlike = 2.0 * math.log(max(steps[j].size, 1e-12) / factor / sizes[i])
                     cost += away / 5.0 + min(unlike**2, 8.0) if away <= 30.0 else math.inf
-                    cost -= own if away <= 0.03 else 0.0
+                    cost -= bonus if away <= 0.03 else 0.0
                 if cost < best[0]:
                     best = cost, pairs
     return best[1]
@@ -472,8 +472,8 @@ class Looked:
 )
 def test_step_time_is_fitted_beside_drift_and_ringing(start: float, took: float, middle: float) -> None:
     step = DotStep(1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200)
-    found = steps_module.time_of_step(RIG, moved_by(start, took), step, (2000.0, 6000.0), 1e-3)
-    assert found == pytest.approx((start, took), abs=1e-3 if took else 2e-5)
+    fitted = steps_module.time_of_step(RIG, moved_by(start, took), step, (2000.0, 6000.0), 1e-3)
+    assert fitted == pytest.approx((start, took), abs=1e-3 if took else 2e-5)
 
 
 @pytest.mark.parametrize(
@@ -503,10 +503,10 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
             return self.dots[part.start - 1_000_000 : part.stop - 1_000_000]
 
     step = DotStep(1_003_000.0, 1e-4, 1_002_800, 1_003_200)
-    found = steps_module.time_of_step(
+    fitted = steps_module.time_of_step(
         RIG, cast(FloatArray, Later(moved_by(3.0, 0.0, rung=100.0))), step, (0.0, 2e6), 1e-3
     )
-    assert found == pytest.approx((1003.0, 0.0), abs=3e-4)
+    assert fitted == pytest.approx((1003.0, 0.0), abs=3e-4)
 
 
 def test_motion_is_rough_beyond_three_times_the_noise() -> None:
@@ -526,16 +526,16 @@ def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
     rough = note(2.0, 2.0, 0.5, rest_only=True)
     assert annotated_times.without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
-    found = annotated_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
-    assert found.loads is loads
-    assert found.notes == (sudden, rough)
+    correction = annotated_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
+    assert correction.loads is loads
+    assert correction.notes == (sudden, rough)
     ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
-    assert np.flatnonzero(found.unused).tolist() == list(range(1980, math.floor(1000.0 * ends) + 1))
+    assert np.flatnonzero(correction.unused).tolist() == list(range(1980, math.floor(1000.0 * ends) + 1))
     rest = quiet.copy()
     rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
     rest[2500:2520] = 1000.0
-    found = annotated_times.without_rough_motion(RIG, loads, [slow], rest)
-    assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
+    correction = annotated_times.without_rough_motion(RIG, loads, [slow], rest)
+    assert (correction.notes, correction.unused.sum(), len(correction.unused)) == ((slow,), 0, count)
 
 
 def with_pieces(
@@ -622,16 +622,16 @@ def test_load_cell_noise_is_removed_for_any_times(monkeypatch: pytest.MonkeyPatc
     dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
     noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
     with_pieces(monkeypatch, [], {})
-    found = annotated_times.correct_loads(RIG, dots, noisy)
-    assert found is not None
-    assert [m.first for m in found.measured] == [0, 1500]
-    assert (found.notes, found.timed, found.unused.sum(), found.unused.shape) == ((), (), 0, (2000,))
-    assert np.ptp(found.loads[:1500], axis=0).tolist() == [0.0] * 3
+    corrected = annotated_times.correct_loads(RIG, dots, noisy)
+    assert corrected is not None
+    assert [m.first for m in corrected.measured] == [0, 1500]
+    assert (corrected.notes, corrected.timed, corrected.unused.sum(), corrected.unused.shape) == ((), (), 0, (2000,))
+    assert np.ptp(corrected.loads[:1500], axis=0).tolist() == [0.0] * 3
     with_pieces(monkeypatch, as_steps((400.0, 1e-4)), {400.0: (0.4, 0.0)})
-    found = annotated_times.correct_loads(RIG, dots, noisy)
-    assert found is not None
-    assert [m.first for m in found.measured] == [0, 1500]
-    assert [n.applied for n in found.notes] == [0.4]
+    corrected = annotated_times.correct_loads(RIG, dots, noisy)
+    assert corrected is not None
+    assert [m.first for m in corrected.measured] == [0, 1500]
+    assert [n.applied for n in corrected.notes] == [0.4]
 
 
 PLATE_RIG = load_rig(
@@ -667,8 +667,8 @@ def test_plate_motion_needs_every_reading() -> None:
 
 def test_part_across_plate_is_least_squares_residual() -> None:
     dots = np.random.default_rng(1).normal(size=(4, 5))
-    left = dots - PLATE @ np.linalg.lstsq(PLATE, dots, rcond=None)[0]
-    (found,), (across,) = across_plate(PLATE_RIG, as_volts(dots)), across_of(PLATE_RIG)
-    assert np.abs(found) == pytest.approx(np.linalg.norm(left, axis=0))
-    assert across[:, None] * found == pytest.approx(left)
+    residual = dots - PLATE @ np.linalg.lstsq(PLATE, dots, rcond=None)[0]
+    (size,), (across,) = across_plate(PLATE_RIG, as_volts(dots)), across_of(PLATE_RIG)
+    assert np.abs(size) == pytest.approx(np.linalg.norm(residual, axis=0))
+    assert across[:, None] * size == pytest.approx(residual)
     assert PLATE.T @ across == pytest.approx(np.zeros(3), abs=1e-12)

@@ -38,7 +38,7 @@ SWUNG = read(swung(1.0, 1.3))
 
 
 def test_sway_is_named_alike_everywhere() -> None:
-    checked, steady, log, found = answers(SWUNG, HELD)
+    checked, steady, log, discovery = answers(SWUNG, HELD)
     assert [(f.name, f.where, f.value) for f in checked.findings] == [('load_value', 'load 3', None)]
     words = checked.findings[0].fix
     assert words.startswith('the weight that hung on the link of x from 12.000 s to 16.000 s swayed at 1.3')
@@ -48,25 +48,25 @@ def test_sway_is_named_alike_everywhere() -> None:
     assert np.isnan(steady.volts[12_000:16_000]).all()
     assert np.isfinite(steady.volts[:12_000]).all()
     assert np.isfinite(steady.volts[20_000:]).all()
-    assert [f.fix for f in found.setup] == [words]
-    assert found.verdict == 'nothing_missing'
+    assert [f.fix for f in discovery.setup] == [words]
+    assert discovery.verdict == 'nothing_missing'
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('force', 'frequency', 'axis'), [(0.5, 0.9, 0), (2.0, 1.6, 0), (1.0, 1.1, 1)])
 def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: float, axis: int) -> None:
-    (found,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HELD)
-    assert found.hold.number == 3
-    assert found.frequency == pytest.approx(frequency, abs=0.02)
-    assert found.force == pytest.approx(force, rel=0.1)
+    (sway,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HELD)
+    assert sway.hold.number == 3
+    assert sway.frequency == pytest.approx(frequency, abs=0.02)
+    assert sway.force == pytest.approx(force, rel=0.1)
     # How it swung, but for how much more a link of 14 Hz swings than under a load that rests.
-    assert found.swung is not None
+    assert sway.swung is not None
     true = (swung(force, frequency, axis) - HELD)[3 * DWELL : 4 * DWELL]
-    assert np.abs(found.swung - true).max() < 0.03 * force
+    assert np.abs(sway.swung - true).max() < 0.03 * force
     assert effective.swung(len(HELD), []) is None
-    every = effective.swung(len(HELD), [found])
+    every = effective.swung(len(HELD), [sway])
     assert every is not None
-    np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], found.swung)
+    np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], sway.swung)
 
 
 def test_apparent_step_excludes_sway_from_its_start() -> None:
@@ -78,8 +78,8 @@ def test_apparent_step_excludes_sway_from_its_start() -> None:
         dataclasses.replace(annotated[3], first=cut, unannotated=True),
         *annotated[4:],
     ]
-    (found,) = effective.swaying(asked(pieces), annotated, asked, 1e-3)
-    assert (found.hold.first, found.hold.last) == (3 * DWELL, 4 * DWELL)
+    (sway,) = effective.swaying(asked(pieces), annotated, asked, 1e-3)
+    assert (sway.hold.first, sway.hold.last) == (3 * DWELL, 4 * DWELL)
 
 
 ROTATED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
@@ -124,12 +124,12 @@ def test_a_swing_is_what_no_constant_load_explains() -> None:
     rest[1, 3 * n // size : n] += 2e-5 * force.reshape(-1, size).mean(axis=1)
     none = np.zeros((6, 3))
     implied = ImpliedLoads(held, none, rest, rest, rest[:1], none[:, 0], np.array([1e-5, 2e-5, 1e-4]), size)
-    (found,) = effective.swaying(implied, held, lambda _: implied, 1e-3)
-    assert found.hold is held[3]
-    assert [found.frequency, found.force] == [pytest.approx(1.3, abs=0.01), pytest.approx(1.6, abs=0.1)]
-    assert found.swung is not None
-    np.testing.assert_allclose(found.swung[:, 1], force, atol=5e-3)
-    assert np.abs(found.swung[:, [0, 2]]).max() < 1e-3
+    (sway,) = effective.swaying(implied, held, lambda _: implied, 1e-3)
+    assert sway.hold is held[3]
+    assert [sway.frequency, sway.force] == [pytest.approx(1.3, abs=0.01), pytest.approx(1.6, abs=0.1)]
+    assert sway.swung is not None
+    np.testing.assert_allclose(sway.swung[:, 1], force, atol=5e-3)
+    assert np.abs(sway.swung[:, [0, 2]]).max() < 1e-3
     # Of two lost holds nothing is known, and what is less than eight times the median is no sway.
     lost = rest.copy()
     lost[:, n // size : 3 * n // size] = np.nan
@@ -160,7 +160,7 @@ VOLTS = read(SHORT_HELD)
 @pytest.mark.slow
 def test_unannotated_loads_are_named_alike_everywhere() -> None:
     words = f'x: from 8.000 s to the end the load changed 8 times, and {WORDS}'
-    checked, known, log, found = answers(VOLTS, STOPPED)
+    checked, known, log, discovery = answers(VOLTS, STOPPED)
     # The loads that are left move all readings, but none of them along Y alone.
     reported, pushes = checked.findings
     assert (reported.name, reported.where, reported.fix) == ('load_coverage', 'load_fx load_fy load_tz', words)
@@ -170,11 +170,11 @@ def test_unannotated_loads_are_named_alike_everywhere() -> None:
     assert log == [words]
     assert np.isnan(known.volts[8_000:]).all()
     assert np.isfinite(known.volts[:8_000]).all()
-    (reported,) = found.setup
+    (reported,) = discovery.setup
     assert (reported.name, reported.fix) == ('load_coverage', words)
     assert reported.value == pytest.approx(16 / 24)
-    assert found.verdict == 'nothing_missing'
-    assert found.simulations <= 300
+    assert discovery.verdict == 'nothing_missing'
+    assert discovery.simulations <= 300
 
 
 def test_missing_loads_are_excluded_until_next_note() -> None:
@@ -197,7 +197,7 @@ def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
 
 
 def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: float = 10.0) -> ImpliedLoads:
-    """Plateaus of 2 s under one annotated load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
+    """Holds of 2 s under one annotated load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
     rows = np.array([(0.0, y, 0.0) for y in more])
     listed = tuple(
         Hold(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, annotated, 0.0))) for i in range(len(more))
@@ -218,9 +218,9 @@ def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: floa
 
 def test_change_counts_above_three_times_allowed_effects() -> None:
     """That is 0.3 N and 1 % of the largest load, which is 20 N: 1.5 N in all."""
-    (found,) = unannotated_times(asked([0.0, 1.6, 0.0, 1.6], alone=1), 20_000, 0.001)
-    assert (found.first, found.last, found.changes) == (2000, 8000, 3)
-    assert found.value == found.size == pytest.approx(0.3)
+    (span,) = unannotated_times(asked([0.0, 1.6, 0.0, 1.6], alone=1), 20_000, 0.001)
+    assert (span.first, span.last, span.changes) == (2000, 8000, 3)
+    assert span.value == span.size == pytest.approx(0.3)
     assert unannotated_times(asked([0.0, 1.4, 0.0, 1.4], alone=1), 20_000, 0.001) == []
     # Where nobody knows any load there is nothing left to compare.
     of = asked([0.0, 1.6, 0.0, 1.6], alone=1)

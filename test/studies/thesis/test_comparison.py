@@ -99,9 +99,9 @@ def test_table_5_1_by_cause(label: str) -> None:
 
 def test_printed_search_without_a_hit_has_no_numbers() -> None:
     solver = make_solver('iterative_printed', comparison.thesis_geometry(), criterion='absolute')
-    found = solver.solve((5e-3, 5e-3, -5e-3, -5e-3), tuple(comparison.VARIANCES.tolist()))
-    assert (found.status, found.phi, found.omega, found.iterations) == (SolverStatus.NO_HIT, 0.0, 0.0, 401)
-    assert np.isnan([found.dx, found.dy, found.theta, *found.covariance, *found.residual]).all()
+    solution = solver.solve((5e-3, 5e-3, -5e-3, -5e-3), tuple(comparison.VARIANCES.tolist()))
+    assert (solution.status, solution.phi, solution.omega, solution.iterations) == (SolverStatus.NO_HIT, 0.0, 0.0, 401)
+    assert np.isnan([solution.dx, solution.dy, solution.theta, *solution.covariance, *solution.residual]).all()
 
 
 def test_every_method_is_a_row_or_is_rejected_with_a_reason() -> None:
@@ -187,13 +187,13 @@ def test_table_b2() -> None:
 def test_ratio_depends_on_link_lengths_unless_equal() -> None:
     # Conclusion 3 of the appendix holds only because L_CD = L_BC.
     aluminium = scaling.MATERIALS[0]
-    one = scaling.torsion_to_bending_ratio(aluminium.youngs_modulus, aluminium.shear_modulus)
+    ratio = scaling.torsion_to_bending_ratio(aluminium.youngs_modulus, aluminium.shear_modulus)
     link = CASES[0].link
     force, length_cd = 1e-3, 0.3
     statics = link.statics
     by_twist = length_cd * statics.deflection(0.0, 0.0, force * length_cd)[2]
     bending = statics.deflection(0.0, force, 0.0)[1]
-    assert by_twist / bending == pytest.approx(one * (length_cd / link.length) ** 2, rel=1e-12)
+    assert by_twist / bending == pytest.approx(ratio * (length_cd / link.length) ** 2, rel=1e-12)
     assert scaling.torsion_to_bending_ratio(69e9, 24e9, length_cd / link.length) == pytest.approx(
         by_twist / bending, rel=1e-12
     )

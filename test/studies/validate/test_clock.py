@@ -32,8 +32,8 @@ from psd_deflection.studies.validate.clock import (
 )
 
 
-def motion_of(run: ClockRecording, kept: Array | None = None) -> Motion:
-    index = np.arange(len(run.t)) if kept is None else np.flatnonzero(kept)
+def motion_of(run: ClockRecording, present: Array | None = None) -> Motion:
+    index = np.arange(len(run.t)) if present is None else np.flatnonzero(present)
     return motion_of_samples(run.t[index], run.dots[index])
 
 
@@ -49,8 +49,8 @@ def test_intervals_hold_the_truth() -> None:
 def test_scale_turn_and_bias_of_the_reference_do_not_matter() -> None:
     run = simulated(3)
     rotated = run.poses @ np.array([[1.02, 0.03, 0.0], [-0.03, 0.97, 0.0], [0.0, 0.0, 1.1]]) + [1e-3, -2e-3, 0.05]
-    found = clock_offset(motion_of(run), run.stamps, rotated, exposure=0.008)
-    assert abs(found.value - run.offset) < 4.0 * found.sd < 0.4e-3
+    offset = clock_offset(motion_of(run), run.stamps, rotated, exposure=0.008)
+    assert abs(offset.value - run.offset) < 4.0 * offset.sd < 0.4e-3
 
 
 def test_outliers_do_not_move_it() -> None:
@@ -58,31 +58,31 @@ def test_outliers_do_not_move_it() -> None:
     rng = np.random.default_rng(0)
     bad = rng.random(len(run.poses)) < 0.1
     run.poses[bad] += rng.normal(0.0, [2e-3, 2e-3, 0.02], (int(bad.sum()), 3))
-    found = clock_offset(motion_of(run), run.stamps, run.poses, exposure=0.008)
-    assert abs(found.value - run.offset) < 4.0 * found.sd < 0.6e-3
+    offset = clock_offset(motion_of(run), run.stamps, run.poses, exposure=0.008)
+    assert abs(offset.value - run.offset) < 4.0 * offset.sd < 0.6e-3
 
 
 def test_a_drift_is_found() -> None:
     run = simulated(6, seconds=20.0, steps=(1.0, 6.0, 11.0, 17.0))
     middle = float(run.stamps.mean())
     drifting = run.stamps - 200e-6 * (run.stamps - middle)
-    found = clock_offset(motion_of(run), drifting, run.poses, exposure=0.008)
-    assert found.drift == pytest.approx(200e-6, abs=4.0 * found.drift_sd)
-    assert 'drifts by' in found.sentence
+    offset = clock_offset(motion_of(run), drifting, run.poses, exposure=0.008)
+    assert offset.drift == pytest.approx(200e-6, abs=4.0 * offset.drift_sd)
+    assert 'drifts by' in offset.sentence
 
 
 def test_clocks_that_count_from_different_days() -> None:
     run = simulated(7)
-    found = clock_offset(motion_of(run), run.stamps + 1.7e9, run.poses, exposure=0.008)
-    assert found.value == pytest.approx(run.offset - 1.7e9, abs=0.3e-3)
-    assert found.determined
+    offset = clock_offset(motion_of(run), run.stamps + 1.7e9, run.poses, exposure=0.008)
+    assert offset.value == pytest.approx(run.offset - 1.7e9, abs=0.3e-3)
+    assert offset.determined
 
 
 def test_a_link_at_rest_gives_nothing() -> None:
     run = simulated(8, steps=())
-    found = clock_offset(motion_of(run), run.stamps, run.poses)
-    assert not found.determined
-    assert 'moves too little' in found.sentence
+    offset = clock_offset(motion_of(run), run.stamps, run.poses)
+    assert not offset.determined
+    assert 'moves too little' in offset.sentence
 
 
 def test_a_motion_that_repeats_has_rivals() -> None:
@@ -93,10 +93,10 @@ def test_a_motion_that_repeats_has_rivals() -> None:
     noise = np.random.default_rng(0).normal(0.0, [10e-6, 10e-6, 3e-4], run.poses.shape)
     at = run.stamps + run.offset
     poses = np.column_stack([1e-3 * np.sin(2 * np.pi * 5.0 * at), np.zeros((len(at), 2))]) + noise
-    found = clock_offset(motion, at, poses)
-    assert not found.determined
-    assert any(abs(abs(r - found.value) - 0.2) < 2e-3 for r in found.alternatives)
-    assert 'repeats itself' in found.sentence
+    offset = clock_offset(motion, at, poses)
+    assert not offset.determined
+    assert any(abs(abs(r - offset.value) - 0.2) < 2e-3 for r in offset.alternatives)
+    assert 'repeats itself' in offset.sentence
 
 
 AnyArray = npt.NDArray[Any]
@@ -123,7 +123,7 @@ def test_the_interval_holds_95_percent() -> None:
 
 
 @pytest.mark.parametrize(
-    ('found', 'words'),
+    ('offset', 'words'),
     [
         (
             Offset(0.0123, 1e-3, 0.0, 1e-6, True, (-0.1, 0.25), 100),
@@ -151,8 +151,8 @@ def test_the_interval_holds_95_percent() -> None:
         ),
     ],
 )
-def test_the_sentence_word_for_word(found: Offset, words: str) -> None:
-    assert found.sentence == words
+def test_the_sentence_word_for_word(offset: Offset, words: str) -> None:
+    assert offset.sentence == words
 
 
 def biweight(u: float) -> float:
@@ -167,9 +167,9 @@ def test_the_biweight_is_the_integral_of_its_influence() -> None:
     assert biweight_sum(np.array(u[:1])) == pytest.approx(of_each[0], rel=1e-9)
 
 
-def fit_with(value: float, left: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0)) -> OffsetFit:
+def fit_with(value: float, residual: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0)) -> OffsetFit:
     """Leaves so much on every axis of 50 references."""
-    return OffsetFit(value, 1e-3 + abs(value), 2e-6, 3e-6, np.full((50, 3), left), np.array(sizes))
+    return OffsetFit(value, 1e-3 + abs(value), 2e-6, 3e-6, np.full((50, 3), residual), np.array(sizes))
 
 
 def found_of(
@@ -177,13 +177,13 @@ def found_of(
 ) -> tuple[Offset, list[float | None]]:
     """The offset if the refinement gives ``fits``, and the best fit that each was told of. 256 samples a second."""
     reported: list[float | None] = []
-    left = iter(fits)
+    remaining = iter(fits)
 
     def refined(
         motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: OffsetFit | None
     ) -> OffsetFit | None:
         reported.append(None if best is None else best.value)
-        return next(left)
+        return next(remaining)
 
     monkeypatch.setattr(clock, 'coarse_offsets', lambda *_: [0.0] * len(fits))
     monkeypatch.setattr(clock, 'refined_offset', refined)
@@ -209,11 +209,11 @@ def test_the_best_fit_is_taken_and_its_alternatives_are_given(monkeypatch: pytes
         fit_with(0.5 + 4.9 / 256.0, 0.3),
         fit_with(-0.5 - 4.9 / 256.0, 0.3),
     ]
-    found, reported = found_of(monkeypatch, fits, np.zeros((50, 3)))
-    assert (found.value, found.sd, found.drift, found.drift_sd) == (0.1, 0.101, 2e-6, 3e-6)
-    assert found.used == 50
+    offset, reported = found_of(monkeypatch, fits, np.zeros((50, 3)))
+    assert (offset.value, offset.sd, offset.drift, offset.drift_sd) == (0.1, 0.101, 2e-6, 3e-6)
+    assert offset.used == 50
     places = (0.3, 0.1 + 5.1 / 256.0, 0.1 - 5.1 / 256.0, 0.5 + 4.9 / 256.0, -0.5 - 4.9 / 256.0)
-    assert found.alternatives == pytest.approx(places)
+    assert offset.alternatives == pytest.approx(places)
     assert reported == [None, 0.3, 0.3, *[0.1] * 9]
 
 
@@ -224,8 +224,8 @@ def test_a_motion_explains_what_lowers_chi_square_by_100(
     """References that are as far below as above their middle on two axes, 100 numbers, and a fit that leaves 0.1."""
     size = brentq(lambda u: 100.0 * biweight(u) - 150.0 * biweight(0.1) - level, 0.0, 4.0)
     poses = 7.0 + np.outer(np.resize([-size, size], 50), [2.0, 2.0, 0.0])
-    found, _ = found_of(monkeypatch, [fit_with(0.1, 0.2, (2.0, 2.0, 2.0))], poses)
-    assert found.explained is explained
+    offset, _ = found_of(monkeypatch, [fit_with(0.1, 0.2, (2.0, 2.0, 2.0))], poses)
+    assert offset.explained is explained
 
 
 def test_without_a_fit_there_is_no_offset(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,12 +242,12 @@ def coarse_by_hand(poses: AnyArray, there: AnyArray, place: AnyArray, reference:
     for i, lag in enumerate(lags):
         if len(inside[i]) < 20 or 2 * len(inside[i]) < most:
             continue
-        own = [j for j, p in enumerate(place) if 0 <= p + lag < len(poses) and there[p + lag]]
+        rows = [j for j, p in enumerate(place) if 0 <= p + lag < len(poses) and there[p + lag]]
         cost[i] = 0.0
         for axis in range(3):
-            a, b = poses[inside[i], axis], reference[own, axis]
+            a, b = poses[inside[i], axis], reference[rows, axis]
             if np.ptp(a) > 0.0 and np.ptp(b) > 0.0:
-                cost[i] += len(own) * np.log(1.0 - np.corrcoef(a, b)[0, 1] ** 2)
+                cost[i] += len(rows) * np.log(1.0 - np.corrcoef(a, b)[0, 1] ** 2)
     lowest = [i for i in range(len(lags)) if np.isfinite(cost[i]) and cost[i] == cost[max(i - 5, 0) : i + 6].min()]
     return [lags[i] for i in sorted(lowest, key=lambda i: cost[i])[:5]]
 
@@ -284,8 +284,8 @@ def test_the_first_look_is_a_regression_at_every_lag(
     # Missing samples lie between their neighbours and do not count.
     wanted = coarse_by_hand(poses, there, place, reference, reach)
     assert len(wanted) >= 1
-    found = coarse_offsets(motion, 5.0 + 1e-3 * (place + 0.3), reference, 1e-3 * (reach - 0.4))
-    assert found == pytest.approx([1e-3 * lag for lag in wanted])
+    offsets = coarse_offsets(motion, 5.0 + 1e-3 * (place + 0.3), reference, 1e-3 * (reach - 0.4))
+    assert offsets == pytest.approx([1e-3 * lag for lag in wanted])
 
 
 @pytest.mark.parametrize('sign', [1, -1])
@@ -325,35 +325,35 @@ def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, sti
     np.testing.assert_allclose(again, weights, atol=1e-9)
     causes = np.column_stack([np.ones(k), observed[:, moving]])
     # One bias and one row of scales an axis; the offset moves all three at once.
-    columns, left, sizes = np.zeros((3 * k, 3 * causes.shape[1])), np.empty((k, 3)), np.empty(3)
+    columns, residual, sizes = np.zeros((3 * k, 3 * causes.shape[1])), np.empty((k, 3)), np.empty(3)
     does = np.empty(3 * k)
     for axis in range(3):
         rows = slice(axis * k, (axis + 1) * k)
         terms, _ = dense(causes, poses[:, axis], weights[:, axis])
-        left[:, axis] = poses[:, axis] - causes @ terms
-        sizes[axis] = median_abs_deviation(left[:, axis], scale='normal')
+        residual[:, axis] = poses[:, axis] - causes @ terms
+        sizes[axis] = median_abs_deviation(residual[:, axis], scale='normal')
         columns[rows, axis * causes.shape[1] : (axis + 1) * causes.shape[1]] = causes
         does[rows] = rates[:, moving] @ terms[1:]
-    np.testing.assert_allclose(fit.residual, left, atol=1e-9)
+    np.testing.assert_allclose(fit.residual, residual, atol=1e-9)
     np.testing.assert_allclose(fit.sizes, sizes, rtol=1e-3)
-    tukey = np.where(np.abs(left / sizes) < 4.685, (1.0 - (left / sizes / 4.685) ** 2) ** 2, 0.0)
+    tukey = np.where(np.abs(residual / sizes) < 4.685, (1.0 - (residual / sizes / 4.685) ** 2) ** 2, 0.0)
     np.testing.assert_allclose(weights, tukey, atol=1e-3)
     w = (weights / fit.sizes**2).T.ravel()
     values = poses.T.ravel()
     terms, covariance = dense(np.column_stack([columns, does]), values, w)
     assert step == pytest.approx(terms[-1], rel=1e-6)
     # What the offset and its growth do beside bias and scales.
-    own = does - columns @ dense(columns, does, w)[0]
+    slope = does - columns @ dense(columns, does, w)[0]
     ramp = does * np.tile(t, 3)
     ramp -= columns @ dense(columns, ramp, w)[0]
-    growth, deviation = dense(np.column_stack([own, ramp]), left.T.ravel(), w)
+    growth, deviation = dense(np.column_stack([slope, ramp]), residual.T.ravel(), w)
     assert fit.drift == pytest.approx(growth[1], rel=1e-6)
     # No less than that of least squares, and more if what is left has a memory.
-    scores = (w * own * left.T.ravel()).reshape(3, k).sum(axis=0)
+    scores = (w * slope * residual.T.ravel()).reshape(3, k).sum(axis=0)
     expected = max(newey_west(scores) * covariance[-1, -1] ** 2, covariance[-1, -1])
     assert fit.sd == pytest.approx(np.sqrt(expected), rel=1e-6)
-    rest = ramp - own * dense(own[:, None], ramp, w)[0]
-    scores = (w * rest * left.T.ravel()).reshape(3, k).sum(axis=0)
+    rest = ramp - slope * dense(slope[:, None], ramp, w)[0]
+    scores = (w * rest * residual.T.ravel()).reshape(3, k).sum(axis=0)
     expected = max(newey_west(scores) * deviation[1, 1] ** 2, deviation[1, 1])
     assert fit.drift_sd == pytest.approx(np.sqrt(expected), rel=1e-6)
 
@@ -414,11 +414,11 @@ def test_what_is_far_above_the_best_is_not_finished(
     passes = []
     solved = UsedReferences.solved
 
-    def counted(used: UsedReferences, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
+    def counting(used: UsedReferences, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
         passes.append(used)
         return solved(used, weights)
 
-    monkeypatch.setattr(UsedReferences, 'solved', counted)
+    monkeypatch.setattr(UsedReferences, 'solved', counting)
     refined_offset(motion, at, poses, 0.03, 0.0, best)
     assert (len(passes) > 2) is finished
     assert finished or len(passes) == 2
@@ -435,9 +435,9 @@ def steps_of(monkeypatch: pytest.MonkeyPatch, start: float, noise: float) -> lis
     solved = UsedReferences.solved
 
     def recorded(used: UsedReferences, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
-        found = solved(used, weights)
-        steps.append(abs(found[0]))
-        return found
+        step = solved(used, weights)
+        steps.append(abs(step[0]))
+        return step
 
     with monkeypatch.context() as patched:
         patched.setattr(UsedReferences, 'solved', recorded)

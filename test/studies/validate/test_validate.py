@@ -66,33 +66,33 @@ def problem() -> ValidateProblem:
 
 
 def test_the_offset_is_removed_if_asked(problem: ValidateProblem) -> None:
-    found = validate(problem)
-    assert found.applied
-    assert found.offset.value == pytest.approx(LATE, abs=4.0 * found.offset.sd)
-    assert found.t == pytest.approx(problem.t + found.offset.value)
-    np.testing.assert_allclose(found.estimates['exact'], pose(found.t), atol=1e-6)
-    assert found.reference.tolist() == problem.reference.tolist()
-    assert [a.bias for a in found.agreements['exact']] == pytest.approx([0.1, -0.2, 0.3], abs=2e-3)
-    assert [a.noise for a in found.agreements['exact']] == pytest.approx(NOISE.std(axis=0).tolist(), rel=0.1)
-    assert found.excluded == 0
-    assert np.isnan(found.covered).all()
-    assert found.problem is problem
+    validation = validate(problem)
+    assert validation.applied
+    assert validation.offset.value == pytest.approx(LATE, abs=4.0 * validation.offset.sd)
+    assert validation.t == pytest.approx(problem.t + validation.offset.value)
+    np.testing.assert_allclose(validation.estimates['exact'], pose(validation.t), atol=1e-6)
+    assert validation.reference.tolist() == problem.reference.tolist()
+    assert [a.bias for a in validation.agreements['exact']] == pytest.approx([0.1, -0.2, 0.3], abs=2e-3)
+    assert [a.noise for a in validation.agreements['exact']] == pytest.approx(NOISE.std(axis=0).tolist(), rel=0.1)
+    assert validation.excluded == 0
+    assert np.isnan(validation.covered).all()
+    assert validation.problem is problem
 
 
 def test_an_offset_that_is_not_reported_is_not_removed(problem: ValidateProblem) -> None:
     noise = np.random.default_rng(1).normal(0.0, 1.0, (90, 3))
-    found = validate(replace(problem, reference=noise))
-    assert not found.offset.determined
-    assert not found.applied
-    assert found.t.tolist() == problem.t.tolist()
+    validation = validate(replace(problem, reference=noise))
+    assert not validation.offset.determined
+    assert not validation.applied
+    assert validation.t.tolist() == problem.t.tolist()
 
 
 def test_each_reference_is_a_mean_over_its_exposure(problem: ValidateProblem) -> None:
     within = (np.arange(100) - 49.5) * 0.4e-3
-    found = validate(replace(problem, align=False, exposure=0.04))
+    validation = validate(replace(problem, align=False, exposure=0.04))
     expected = np.mean([pose(problem.t + u) for u in within], axis=0)
     middle = (problem.t > 0.1) & (problem.t < 2.7)
-    np.testing.assert_allclose(found.estimates['exact'][middle], expected[middle], atol=2e-5)
+    np.testing.assert_allclose(validation.estimates['exact'][middle], expected[middle], atol=2e-5)
     assert np.abs(pose(problem.t) - expected).max() > 0.01
 
 
@@ -101,12 +101,12 @@ def test_references_without_samples_are_left_out(problem: ValidateProblem) -> No
     t = np.concatenate([early, problem.t])
     reference = np.concatenate([np.zeros((7, 3)), problem.reference])
     sd = np.concatenate([np.zeros((7, 3)), np.ones((90, 3))])
-    found = validate(replace(problem, t=t, reference=reference, sd=sd, align=False))
-    assert found.excluded == 7
-    assert found.t.tolist() == problem.t.tolist()
-    assert found.reference.tolist() == problem.reference.tolist()
-    assert found.estimates['exact'].shape == (90, 3)
-    assert found.covered == (1.0, 1.0, 1.0)
+    validation = validate(replace(problem, t=t, reference=reference, sd=sd, align=False))
+    assert validation.excluded == 7
+    assert validation.t.tolist() == problem.t.tolist()
+    assert validation.reference.tolist() == problem.reference.tolist()
+    assert validation.estimates['exact'].shape == (90, 3)
+    assert validation.covered == (1.0, 1.0, 1.0)
 
 
 def test_cover_counts_what_lies_within_both_deviations(problem: ValidateProblem) -> None:
@@ -130,18 +130,18 @@ def test_a_solver_that_answers_too_rarely_is_not_judged(problem: ValidateProblem
         sd = np.full((90, 3), 1.0)
         return replace(problem, align=False, sd=sd, solvers={'exact': first_three, 'wls': solve})
 
-    found = validate(rarely(20))
-    assert list(found.agreements) == ['exact', 'wls']
-    kept = validate(replace(problem, align=False, t=problem.t[:20], reference=problem.reference[:20]))
-    assert [a.bias for a in found.agreements['wls']] == pytest.approx([a.bias for a in kept.agreements['exact']])
-    found = validate(rarely(19))
-    assert list(found.agreements) == ['exact']
-    assert list(found.estimates) == ['exact', 'wls']
+    validation = validate(rarely(20))
+    assert list(validation.agreements) == ['exact', 'wls']
+    fewer = validate(replace(problem, align=False, t=problem.t[:20], reference=problem.reference[:20]))
+    assert [a.bias for a in validation.agreements['wls']] == pytest.approx([a.bias for a in fewer.agreements['exact']])
+    validation = validate(rarely(19))
+    assert list(validation.agreements) == ['exact']
+    assert list(validation.estimates) == ['exact', 'wls']
     # The solver of the rig itself: nothing is said about its cover.
-    own = rarely(19)
-    found = validate(replace(own, solvers={'wls': own.solvers['wls'], 'exact': first_three}))
-    assert list(found.agreements) == ['exact']
-    assert np.isnan(found.covered).all()
+    rare = rarely(19)
+    validation = validate(replace(rare, solvers={'wls': rare.solvers['wls'], 'exact': first_three}))
+    assert list(validation.agreements) == ['exact']
+    assert np.isnan(validation.covered).all()
 
 
 START = 1_760_000_000_123_456_789
@@ -175,38 +175,38 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Opened:
 
 
 def test_everything_is_in_seconds_from_the_first_sample(run: Opened) -> None:
-    found = read_validate(run)
-    assert found.motion.t == pytest.approx([0.0, 1e-3, 2.5e-3], abs=1e-15)
-    assert found.t == pytest.approx([-0.5, 1.5])
-    assert found.motion.period == pytest.approx(2e-3)
-    assert found.motion.dots is SAMPLES.dots
-    assert [tuple(mark) for mark in found.marks] == [(2.0, 'push')]
+    problem = read_validate(run)
+    assert problem.motion.t == pytest.approx([0.0, 1e-3, 2.5e-3], abs=1e-15)
+    assert problem.t == pytest.approx([-0.5, 1.5])
+    assert problem.motion.period == pytest.approx(2e-3)
+    assert problem.motion.dots is SAMPLES.dots
+    assert [tuple(mark) for mark in problem.marks] == [(2.0, 'push')]
 
 
 def test_the_references_are_those_of_the_recording_or_of_a_file(run: Opened) -> None:
-    found = read_validate(run)
-    assert found.reference is OWN.poses
-    assert found.sd is OWN.sd
-    assert found.rejected == {'blurred': 2}
-    assert found.estimate_sd is SAMPLES.estimate_sd
-    assert found.sources == {'recording': 'run.csv', 'rig': 'rig.yaml', 'reference': 'run.csv'}
-    found = read_validate(run, 'camera.csv', align=True, largest=3.0, exposure=0.01)
-    assert found.reference is OTHERS.poses
-    assert found.sd is None
-    assert found.t == pytest.approx([0.25])
-    assert found.sources['reference'] == 'camera.csv'
-    assert (found.align, found.largest, found.exposure) == (True, 3.0, 0.01)
+    problem = read_validate(run)
+    assert problem.reference is OWN.poses
+    assert problem.sd is OWN.sd
+    assert problem.rejected == {'blurred': 2}
+    assert problem.estimate_sd is SAMPLES.estimate_sd
+    assert problem.sources == {'recording': 'run.csv', 'rig': 'rig.yaml', 'reference': 'run.csv'}
+    problem = read_validate(run, 'camera.csv', align=True, largest=3.0, exposure=0.01)
+    assert problem.reference is OTHERS.poses
+    assert problem.sd is None
+    assert problem.t == pytest.approx([0.25])
+    assert problem.sources['reference'] == 'camera.csv'
+    assert (problem.align, problem.largest, problem.exposure) == (True, 3.0, 0.01)
 
 
 def test_a_solver_gives_the_pose_or_none(run: Opened) -> None:
-    found = read_validate(run, solvers=['beam', 'wls'])
-    assert list(found.solvers) == ['exact', 'beam', 'wls']
-    np.testing.assert_allclose(found.motion.solve(flat_dots(POSES)), POSES, atol=1e-12)
-    assert found.motion.solve is found.solvers['exact']
+    problem = read_validate(run, solvers=['beam', 'wls'])
+    assert list(problem.solvers) == ['exact', 'beam', 'wls']
+    np.testing.assert_allclose(problem.motion.solve(flat_dots(POSES)), POSES, atol=1e-12)
+    assert problem.motion.solve is problem.solvers['exact']
     # No rigid plate has dots like these: the beam says that it did not converge, and where it was then.
     lost = flat_dots(POSES)
     lost[1] = [0.3, 0.3, -0.3, 0.3]
-    assert np.isnan(found.solvers['beam'](lost)).tolist() == [[False] * 3, [True] * 3, [False] * 3]
+    assert np.isnan(problem.solvers['beam'](lost)).tolist() == [[False] * 3, [True] * 3, [False] * 3]
 
 
 def test_of_all_solvers_those_that_can_are_compared(run: Opened) -> None:
@@ -229,31 +229,31 @@ def test_bias_scale_and_noise_are_separated() -> None:
     rng = np.random.default_rng(0)
     true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 3000))
     reference = true + rng.normal(0.0, 10e-6, 3000)
-    found = agreement(1.004 * true + 5e-6, reference)
-    assert found.bias == pytest.approx(5e-6 + 0.004 * true.mean(), abs=4 * found.bias_sd)
-    assert found.scale == pytest.approx(0.004, abs=4 * found.scale_sd)
-    assert found.scale_sd < 3e-4
-    assert found.noise == pytest.approx(10e-6, rel=0.05)
-    assert found.share == pytest.approx(found.rms / np.abs(reference).max())
+    stats = agreement(1.004 * true + 5e-6, reference)
+    assert stats.bias == pytest.approx(5e-6 + 0.004 * true.mean(), abs=4 * stats.bias_sd)
+    assert stats.scale == pytest.approx(0.004, abs=4 * stats.scale_sd)
+    assert stats.scale_sd < 3e-4
+    assert stats.noise == pytest.approx(10e-6, rel=0.05)
+    assert stats.share == pytest.approx(stats.rms / np.abs(reference).max())
 
 
 def test_a_noisy_reference_does_not_shrink_the_scale() -> None:
     rng = np.random.default_rng(1)
     true = 1e-4 * np.sin(np.linspace(0.0, 300.0, 20000))
-    found = agreement(true, true + rng.normal(0.0, 50e-6, 20000))
+    stats = agreement(true, true + rng.normal(0.0, 50e-6, 20000))
     # The slope of the estimate on this reference would be 1/3 too small.
-    assert abs(found.scale) < 4 * found.scale_sd < 0.1
+    assert abs(stats.scale) < 4 * stats.scale_sd < 0.1
 
 
 def test_limits_are_those_of_bland_and_altman() -> None:
     estimate = np.array([1.0, 2.0, 3.0, 4.0, 6.0])
     reference = np.array([1.1, 1.8, 3.3, 3.9, 5.7])
-    found = agreement(estimate, reference)
+    stats = agreement(estimate, reference)
     d = estimate - reference
-    assert found.bias == pytest.approx(d.mean())
-    assert found.limits == pytest.approx((d.mean() - 1.96 * d.std(ddof=1), d.mean() + 1.96 * d.std(ddof=1)))
-    assert found.rms == pytest.approx(np.sqrt((d**2).mean()))
-    assert found.largest == pytest.approx(0.3)
+    assert stats.bias == pytest.approx(d.mean())
+    assert stats.limits == pytest.approx((d.mean() - 1.96 * d.std(ddof=1), d.mean() + 1.96 * d.std(ddof=1)))
+    assert stats.rms == pytest.approx(np.sqrt((d**2).mean()))
+    assert stats.largest == pytest.approx(0.3)
 
 
 def test_a_reference_that_moves_the_other_way_is_mirrored() -> None:
@@ -285,36 +285,36 @@ def test_slope_and_deviations_are_those_of_a_regression() -> None:
     estimate = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 7.0, 8.0, 9.0, 11.0, 12.0]) + 100.0
     error = 0.1 * np.resize([1.0, -1.0], 10) * [1.0, 2.0, 1.0, 3.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0]
     reference = 0.8 * estimate - 3.0 + error
-    found = agreement(estimate, reference)
+    stats = agreement(estimate, reference)
     fit = linregress(estimate, reference)
-    left = reference - fit.slope * estimate - fit.intercept
-    assert found.scale == pytest.approx(1.0 / fit.slope - 1.0)
-    assert found.noise == pytest.approx(np.sqrt(left @ left / 8.0))
+    residual = reference - fit.slope * estimate - fit.intercept
+    assert stats.scale == pytest.approx(1.0 / fit.slope - 1.0)
+    assert stats.noise == pytest.approx(np.sqrt(residual @ residual / 8.0))
     # Of one over the slope.
-    assert found.scale_sd == pytest.approx(fit.stderr / fit.slope**2)
-    assert found.share == pytest.approx(found.rms / reference[-1])
+    assert stats.scale_sd == pytest.approx(fit.stderr / fit.slope**2)
+    assert stats.share == pytest.approx(stats.rms / reference[-1])
     even = agreement(5.0 + error, np.full(10, 5.0))
     assert even.bias_sd == pytest.approx(error.std(ddof=1) / math.sqrt(10.0))
 
 
 def test_an_estimate_that_stands_still_has_no_scale() -> None:
-    found = agreement(np.full(20, 0.5), np.resize([0.0, 1.0, 0.2], 20))
-    assert math.isnan(found.scale)
-    assert math.isnan(found.scale_sd)
-    assert math.isnan(found.share)
-    assert not found.mirrored
-    assert found.noise == pytest.approx(np.resize([0.0, 1.0, 0.2], 20).std(ddof=1))
-    assert found.largest == 0.5
+    stats = agreement(np.full(20, 0.5), np.resize([0.0, 1.0, 0.2], 20))
+    assert math.isnan(stats.scale)
+    assert math.isnan(stats.scale_sd)
+    assert math.isnan(stats.share)
+    assert not stats.mirrored
+    assert stats.noise == pytest.approx(np.resize([0.0, 1.0, 0.2], 20).std(ddof=1))
+    assert stats.largest == 0.5
 
 
 PERIOD = 2.0**-10
 """s: sums of it are exact."""
 
 
-def of(kept: FloatArray, seed: int = 0, period: float = PERIOD) -> Motion:
-    """Samples at the places ``kept``, a cubic with noise on each channel."""
+def of(places: FloatArray, seed: int = 0, period: float = PERIOD) -> Motion:
+    """Samples at the places ``places``, a cubic with noise on each channel."""
     rng = np.random.default_rng(seed)
-    t = kept * period
+    t = places * period
     dots = np.stack([a + 40.0 * a * t - 900.0 * t**2 + 9e4 * a * t**3 for a in (1.0, -2.0, 0.5, 3.0)], axis=1)
     return Motion(t, dots + rng.normal(0.0, 0.1, dots.shape), period, first_three)
 
@@ -328,21 +328,21 @@ def test_instant_has_polynomial_through_nearby_samples(exposure: float, half: in
     values, rates, variances = motion.dots_at(at * PERIOD, exposure * PERIOD)
     inside, weights = np.polynomial.legendre.leggauss(8)
     for i, instant in enumerate(at):
-        near = np.abs(places - instant) <= half + 0.5
+        window = np.abs(places - instant) <= half + 0.5
         for channel in range(4):
             # From the instant, in samples.
-            u = places[near] - instant
-            fit = Polynomial.fit(u, motion.dots[near, channel], 4).convert()
+            u = places[window] - instant
+            fit = Polynomial.fit(u, motion.dots[window, channel], 4).convert()
             deviation = fit.integ()
             mean = (deviation(0.5 * exposure) - deviation(-0.5 * exposure)) / exposure if exposure else fit(0.0)
             ends = (fit(0.5 * exposure) - fit(-0.5 * exposure)) / exposure if exposure else fit.deriv()(0.0)
             assert values[i, channel] == pytest.approx(mean, rel=1e-9)
             assert rates[i, channel] == pytest.approx(ends / PERIOD, rel=1e-8)
-            left = motion.dots[near, channel] - fit(u)
+            residual = motion.dots[window, channel] - fit(u)
             design = np.vander(u / half, 5)
             share = 0.5 * weights @ np.vander(0.5 * exposure * inside / half, 5)
             factor = share @ np.linalg.solve(design.T @ design, share)
-            assert variances[i, channel] == pytest.approx(left @ left / (len(u) - 5) * factor, rel=1e-7)
+            assert variances[i, channel] == pytest.approx(residual @ residual / (len(u) - 5) * factor, rel=1e-7)
 
 
 def test_nothing_is_known_of_instants_outside_the_samples() -> None:
@@ -455,12 +455,12 @@ def test_coverage_is_reported_if_reference_has_sd() -> None:
 
 
 def test_what_was_left_out_and_rejected_is_counted() -> None:
-    found = replace(PLAIN, excluded=3, problem=replace(PROBLEM, rejected={'too dark': 2, 'blurred': 5}))
-    assert found.sentences()[-2:] == [
+    validation = replace(PLAIN, excluded=3, problem=replace(PROBLEM, rejected={'too dark': 2, 'blurred': 5}))
+    assert validation.sentences()[-2:] == [
         '3 of 7 references have no samples about them and are left out.',
         'The reference gave no answer 7 times: blurred 5, too dark 2.',
     ]
-    assert len(found.sentences()) == 7
+    assert len(validation.sentences()) == 7
 
 
 def test_the_table_has_the_solvers_in_units_that_people_read() -> None:
@@ -493,6 +493,6 @@ def test_programs_get_si_units() -> None:
     assert (offset['determined'], offset['applied'], offset['unit']) == (True, False, 's')
     assert offset['sentence'] == STAMPED_LATE.sentence
     assert list(tree['solvers']) == ['exact', 'wls']
-    assert [one['unit'] for one in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
+    assert [axis['unit'] for axis in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
     assert tree['solvers']['wls']['dy']['bias'] == 1.5e-6
     assert list(tree['covered']) == ['dx', 'dy', 'theta']

@@ -35,28 +35,28 @@ def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_sound_rig_has_no_alarm() -> None:
     run = psd_deflection.simulate(None, (0, -10, -5.85), seconds=10)
     assert isinstance(run, Recording)
-    found = psd_deflection.watch(run)
-    assert found.alarms == ()
-    assert found.sentences()[0].startswith('the rig matches its model; watched: ')
-    assert found.tree()['same'] is True
-    assert found.to_pandas().empty
-    assert 'the rig matches its model' in found.report()
+    watched = psd_deflection.watch(run)
+    assert watched.alarms == ()
+    assert watched.sentences()[0].startswith('the rig matches its model; watched: ')
+    assert watched.tree()['same'] is True
+    assert watched.to_pandas().empty
+    assert 'the rig matches its model' in watched.report()
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings('ignore:.*lacks its parameters')
 def test_a_bump_is_reported_as_by_the_command(bumped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with np.errstate(all='raise'):
-        found = psd_deflection.watch(bumped, psd_deflection.load_rig())
+        watched = psd_deflection.watch(bumped, psd_deflection.load_rig())
     assert main(['replay', str(bumped), '--watch']) == 0
     message = [line for line in capsys.readouterr().out.splitlines() if line.startswith('  watch: ')]
-    assert [f'  watch: {sentence}' for sentence in found.sentences()] == message
-    first = found.alarms[0]
-    assert found.since_s(first) == pytest.approx(18.0, abs=1.0)
-    table = found.to_pandas()
-    assert table.index[0] == found.since_s(first)
+    assert [f'  watch: {sentence}' for sentence in watched.sentences()] == message
+    first = watched.alarms[0]
+    assert watched.since_s(first) == pytest.approx(18.0, abs=1.0)
+    table = watched.to_pandas()
+    assert table.index[0] == watched.since_s(first)
     assert table['channel'].iloc[0] == first.channel
-    assert [path.name for path in found.save(tmp_path / 'out')] == ['report.html', 'watch.json']
+    assert [path.name for path in watched.save(tmp_path / 'out')] == ['report.html', 'watch.json']
     tree = json.loads((tmp_path / 'out' / 'watch.json').read_text())
     assert tree['alarms'][0]['channel'] == first.channel
     assert first.channel in (tmp_path / 'out' / 'report.html').read_text()

@@ -23,13 +23,13 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     added = first * here
     for weight, node in zip(weights, LAG_NODES[1:], strict=False):
         added += weight * samples.between(node * p.period)
-    kept = math.exp(-p.period / tau)
+    decay = math.exp(-p.period / tau)
     if not state:
         # Settled until the first sample.
-        state['added'] = (1.0 - last - kept) * here[:, :1]
-        state['lag'] = kept * here[:, :1]
+        state['added'] = (1.0 - last - decay) * here[:, :1]
+        state['lag'] = decay * here[:, :1]
     drive = np.concatenate((state['added'], added[:, :-1]), axis=1) + last * here
-    lagging, state['lag'] = lfilter([1.0], [1.0, -kept], drive, zi=state['lag'])
+    lagging, state['lag'] = lfilter([1.0], [1.0, -decay], drive, zi=state['lag'])
     state['added'] = added[:, -1:]
     samples.volts[:] = lagging if p.phase == 0.0 else _later(samples, lagging, tau)
 

@@ -20,11 +20,11 @@ def _trace_back(block: Traced, values: Values, remembered: list[float]) -> None:
     if not remembered:
         # Unloaded until now.
         remembered += [0.0, 0.0, 0.0]
-    amplitude, kept = values['amplitude'], block.physics.xp.exp(-block.seconds / values['time_constant'])
+    amplitude, decay = values['amplitude'], block.physics.xp.exp(-block.seconds / values['time_constant'])
     for row in range(3):
-        grown = block.pose[row] - amplitude * kept * remembered[row]
-        block.pose[row] = grown / (1.0 + amplitude * (1.0 - kept))
-        remembered[row] = kept * remembered[row] + (1.0 - kept) * block.pose[row]
+        grown = block.pose[row] - amplitude * decay * remembered[row]
+        block.pose[row] = grown / (1.0 + amplitude * (1.0 - decay))
+        remembered[row] = decay * remembered[row] + (1.0 - decay) * block.pose[row]
 
 
 EFFECT = Effect(

@@ -9,17 +9,17 @@ from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
 
 
-def _turn(dots: FloatArray, psd: float, angle: float, xp: Arithmetic) -> None:
+def _rotate(dots: FloatArray, psd: float, angle: float, xp: Arithmetic) -> None:
     i = 2 * (int(psd) - 1)
     dots[i], dots[i + 1] = rotated(dots[i], dots[i + 1], xp.cos(angle), xp.sin(angle))
 
 
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
-    _turn(samples.dots, values['psd'], values['angle'], samples.physics.xp)
+    _rotate(samples.dots, values['psd'], values['angle'], samples.physics.xp)
 
 
 def _correct(reading: Reading, values: Values) -> None:
-    _turn(reading.dots, values['psd'], -values['angle'], reading.xp)
+    _rotate(reading.dots, values['psd'], -values['angle'], reading.xp)
 
 
 EFFECT = Effect(

@@ -16,13 +16,13 @@ def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
         place = samples.dots[row].copy()
         if values['profile'] == 1:
             for side in (1.0, -1.0):
-                left, moved = cut_disc(half - side * place, radius)
+                share, moved = cut_disc(half - side * place, radius)
                 samples.dots[row] -= side * moved
-                samples.sums[psd] *= left
+                samples.sums[psd] *= share
         else:
-            left, moved = cut_by_edges(place, half, radius)
+            share, moved = cut_by_edges(place, half, radius)
             samples.dots[row] += moved
-            samples.sums[psd] *= left
+            samples.sums[psd] *= share
 
 
 EFFECT = Effect(

@@ -30,7 +30,7 @@ WORDS = {
     ('annotated', 'name', 'where'), [(TWICE, 'load_value', 'load 5'), (NEVER, 'missing_load', '8.000 s')]
 )
 def test_check_calibrate_and_discover_name_load_alike(annotated: FloatArray, name: str, where: str) -> None:
-    checked, run, log, found = answers(QUIET, annotated)
+    checked, run, log, discovery = answers(QUIET, annotated)
     assert [(f.name, f.where) for f in checked.findings] == [(name, where)]
     assert _rounded(checked.findings[0].fix) == WORDS[name]
     assert checked.verdict == 'wrong'
@@ -38,7 +38,7 @@ def test_check_calibrate_and_discover_name_load_alike(annotated: FloatArray, nam
     assert [_rounded(words) for words in log] == [WORDS[name]]
     assert run.loads is not None
     assert np.abs(run.loads - HELD).max(axis=0) == pytest.approx([0.0] * 3, abs=0.1)
-    assert [_rounded(f.fix) for f in found.setup] == [WORDS[name]]
+    assert [_rounded(f.fix) for f in discovery.setup] == [WORDS[name]]
 
 
 def _rounded(words: str) -> str:
@@ -68,10 +68,10 @@ def test_no_note_is_called_wrong_for_what_the_rig_does(true: dict[str, object]) 
 def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     both = annotated_as(5, (80, -80, 40))
     both[DWELL : 2 * DWELL] = (0, -30, 0)
-    found = wrong_notes(RIG, QUIET, both)
-    assert [n.where for n in found] == ['load 1', 'load 5']
-    assert as_applied(both, found) == pytest.approx(HELD, abs=0.1)
-    assert as_applied(both, found) is not both
+    notes = wrong_notes(RIG, QUIET, both)
+    assert [n.where for n in notes] == ['load 1', 'load 5']
+    assert as_applied(both, notes) == pytest.approx(HELD, abs=0.1)
+    assert as_applied(both, notes) is not both
     assert len(wrong_notes(RIG, QUIET[: 7 * DWELL], both[: 7 * DWELL])) == 2
     assert wrong_notes(RIG, QUIET[: 6 * DWELL], both[: 6 * DWELL]) == []
     assert len(wrong_notes(RIG, QUIET[: 6 * DWELL], TWICE[: 6 * DWELL])) == 1
@@ -93,8 +93,8 @@ def long_as(**annotated: tuple[float, float, float]) -> FloatArray:
 
 @pytest.mark.slow
 def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
-    found = wrong_notes(RIG, LONG_QUIET, long_as(p5=(40, -80, 20), p4=(60, 0, 0), p6=(0, 0, 0)))
-    assert [n.where for n in found] == ['load 4', 'load 5', 'load 6']
+    notes = wrong_notes(RIG, LONG_QUIET, long_as(p5=(40, -80, 20), p4=(60, 0, 0), p6=(0, 0, 0)))
+    assert [n.where for n in notes] == ['load 4', 'load 5', 'load 6']
     (note,) = wrong_notes(RIG, QUIET, annotated_as(4, (29, 0, 0)))
     assert note.words('x').endswith('(30 N, 0 N, 0 N m) hung, not (29 N, 0 N, 0 N m): note that')
 
@@ -146,8 +146,8 @@ def asked(off: FloatArray, annotated: FloatArray = ROUNDED, acting: FloatArray |
     """
     listed = tuple(Hold(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
     moved = np.repeat(off.T * 1e-6, 10, axis=1)
-    found = ImpliedLoads(listed, off, np.zeros_like(moved), moved, moved[0], np.zeros(8), np.ones(3), 400)
-    return all_free(found, np.repeat(annotated, DWELL, axis=0) if acting is None else acting)
+    implied = ImpliedLoads(listed, off, np.zeros_like(moved), moved, moved[0], np.zeros(8), np.ones(3), 400)
+    return all_free(implied, np.repeat(annotated, DWELL, axis=0) if acting is None else acting)
 
 
 def test_rounded_notes_free_the_loads_exact_ones_do_not() -> None:
@@ -208,25 +208,25 @@ def observed(
     annotated: FloatArray = VARIED,
     *,
     across: dict[int, float] | None = None,
-    left: float = 0.0,
+    unexplained: float = 0.0,
     everywhere: FloatArray | float = 0.0,
 ) -> ImpliedLoads:
-    """What readings say if loads are off by ``more``; ``left``: share of the movement that no load explains."""
+    """What readings say if loads are off by ``more``; ``unexplained``: share of the movement that no load explains."""
     off = np.zeros(annotated.shape) + everywhere
     for k, load in more.items():
         off[k] += load
     listed = tuple(Hold(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
     moved = np.repeat((off * (1e-5, 1e-5, 1e-4)).T, 10, axis=1)
     beside = np.zeros(len(annotated))
-    for k, far in (across or {}).items():
-        beside[k] = far
-    return ImpliedLoads(listed, off, left * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
+    for k, distance in (across or {}).items():
+        beside[k] = distance
+    return ImpliedLoads(listed, off, unexplained * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
 
 
 def test_load_size_is_plate_movement_at_0_1_m() -> None:
-    found = observed({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
-    assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
-    assert found.annotated.tolist() == VARIED.tolist()
+    implied = observed({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
+    assert implied.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
+    assert implied.annotated.tolist() == VARIED.tolist()
 
 
 @pytest.mark.parametrize(
@@ -248,14 +248,14 @@ def test_load_size_is_plate_movement_at_0_1_m() -> None:
 def test_wrong_loads_need_five_right_ones_beside_them(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    found = holds.outliers(observed(more, VARIED[:count]))
-    assert (found.gone, found.softer) == (gone, 0.0)
+    outliers = holds.outliers(observed(more, VARIED[:count]))
+    assert (outliers.gone, outliers.softer) == (gone, 0.0)
 
 
 def test_beside_loads_within_their_tolerance_six_must_be_right() -> None:
     for count, gone in ((7, (2,)), (6, ())):
-        found = holds.outliers(observed({2: (0.0, 10.0, 0.0)}, VARIED[:count], everywhere=0.2))
-        assert (found.gone, found.softer) == (gone, 0.0)
+        outliers = holds.outliers(observed({2: (0.0, 10.0, 0.0)}, VARIED[:count], everywhere=0.2))
+        assert (outliers.gone, outliers.softer) == (gone, 0.0)
 
 
 @pytest.mark.parametrize(('torque', 'gone'), [(2.4, (2,)), (2.6, ())])
@@ -269,23 +269,23 @@ def test_load_is_known_if_others_leave_a_twentieth_of_it(torque: float, gone: tu
 def test_a_faulty_detector_is_no_wrong_note() -> None:
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
-    for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
-        assert holds.outliers(observed(wrong, across={6: far})).gone == gone
+    for distance, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
+        assert holds.outliers(observed(wrong, across={6: distance})).gone == gone
     assert holds.outliers(observed(wrong, across={1: 1e-3})).gone == (6,)
     # Far beyond the tolerance no plate is asked for.
     far_off = holds.outliers(observed({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
     assert not holds.closes(observed({}))
     assert holds.closes(replace(observed(wrong), rest=np.ones((3, 80)) * [[1e-3], [0.0], [2e-3]]))
-    for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
-        assert holds.outliers(observed(wrong, left=left), bent).gone == gone
+    for unexplained, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
+        assert holds.outliers(observed(wrong, unexplained=unexplained), bent).gone == gone
 
 
 def test_loads_are_free_if_explained_and_two_are_off() -> None:
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
     loads = np.repeat(VARIED, DWELL, axis=0)
-    for left, free in ((0.19, True), (0.21, False)):
-        assert holds.all_free(observed(off, left=left), loads) is free
+    for unexplained, free in ((0.19, True), (0.21, False)):
+        assert holds.all_free(observed(off, unexplained=unexplained), loads) is free
     assert holds.all_free(observed({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, VARIED[:4]), loads)
     assert not holds.all_free(observed({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, VARIED[:3]), loads)
     # Two that are off by more than the tolerance are enough.
@@ -295,9 +295,9 @@ def test_loads_are_free_if_explained_and_two_are_off() -> None:
     assert max(apart) < 2.0
     assert holds.all_free(two, loads)
     # One alone is a wrong note, and others are needed to say so.
-    found = observed({0: (0.0, 0.0, 0.6)})
-    assert int((holds.deviation_in_tolerances(found, (), 0.1) > 1.0).sum()) == 1
-    assert not holds.all_free(found, loads)
+    implied = observed({0: (0.0, 0.0, 0.6)})
+    assert int((holds.deviation_in_tolerances(implied, (), 0.1) > 1.0).sum()) == 1
+    assert not holds.all_free(implied, loads)
 
 
 def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
@@ -340,10 +340,10 @@ def test_forces_may_be_rounded_if_off_by_less_than_a_step(annotated: FloatArray,
 def test_loads_of_which_none_held_were_not_rounded() -> None:
     """As those of a sweep."""
     none = np.zeros((0, 3))
-    found = holds.ImpliedLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
-    assert found.annotated.shape == (0, 3)
-    assert not holds.may_be_rounded(found)
-    assert not holds.all_free(found, none)
+    implied = holds.ImpliedLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
+    assert implied.annotated.shape == (0, 3)
+    assert not holds.may_be_rounded(implied)
+    assert not holds.all_free(implied, none)
 
 
 def world(
@@ -380,11 +380,11 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
         annotated[k] = load
     slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
     asked = world(VARIED, annotated, slopes, offset, bend)
-    found = holds.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked)
-    assert [n.hold.number for n in found] == sorted(wrong)
-    for one in found:
-        assert one.applied == pytest.approx(VARIED[one.hold.number], abs=0.05)
-        assert one.period == 1e-3
+    notes = holds.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked)
+    assert [n.hold.number for n in notes] == sorted(wrong)
+    for note in notes:
+        assert note.applied == pytest.approx(VARIED[note.hold.number], abs=0.05)
+        assert note.period == 1e-3
 
 
 def test_right_notes_are_right_however_nonlinear_the_simulation() -> None:
