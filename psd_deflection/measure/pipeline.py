@@ -470,8 +470,7 @@ class Pipeline:
         if answer.complete and solved is not None and solved.check_result is not None:
             self.estimator.search_outliers(observed.index, solved.readings.dots, solved.check_result)
         findings += self._optics.late_findings(measures, observed.verdict, observed.frozen, self._loudness)
-        if self.estimator.vibrating:
-            findings += (f'vibrates: {self.estimator.vibrates}',)
+        findings += self.estimator.findings
         if answer.estimate is not None:
             findings += self._calibrated.findings(answer.estimate.pose)
         self.counters.count_findings(findings)

@@ -192,6 +192,7 @@ class BlockEstimator:
         self.chi_square = 0.0
         self.poor_fits = 0
         self.vibrating: tuple[Tone, ...] = ()
+        self._fitted: FittedBlock | None = None
         self._use_noise()
 
     def _model(self) -> tuple[FloatArray | None, Residual | None]:
@@ -221,7 +222,7 @@ class BlockEstimator:
 
     def record(self, fitted: FittedBlock | None, excluded: tuple[int, ...]) -> None:
         """Take what the last block was solved from: its fit, None without one, and the PSDs (from 1) not used."""
-        self.excluded, self.vibrating = excluded, ()
+        self.excluded, self.vibrating, self._fitted = excluded, (), fitted
         if fitted is not None:
             self.poor_fits += fitted.poor_fit
             self.vibrating = tuple(self.noise.tones[i] for i in fitted.vibrating)
@@ -274,6 +275,16 @@ class BlockEstimator:
     def vibrates(self) -> str:
         """What the last block could not follow, such as "14 um rms near 87 Hz"; '' if nothing was."""
         return words_of(self.vibrating, self._rig.converter.sample_rate_hz)
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Return what disturbs the last block: vibration, hum, motion that its polynomials cannot follow."""
+        if self._fitted is None:
+            return ()
+        vibrates = f'vibrates: {self.vibrates}' if self.vibrating else ''
+        hum = words_of(self.noise.hum, self._rig.converter.sample_rate_hz)
+        moves = f'moves: faster than {self._size} samples show' if self._fitted.poor_fit else ''
+        return tuple(filter(None, (vibrates, f'hum: {hum}' if hum else '', moves)))
 
     def search_outliers(self, index: int, dots: tuple[float, ...], result: ConsistencyResult) -> None:
         """Take a block into the search for a wrong reading: each inconsistent one, of the others every tenth."""

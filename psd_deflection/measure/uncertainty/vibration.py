@@ -269,12 +269,14 @@ def _filled(places: IntArray, series: FloatArray, length: int) -> FloatArray:
     return out
 
 
-def rms_of(tone: Tone) -> float:
+def rms_of(tone: Tone | Hum) -> float:
     """m: of the reading that it moves most."""
-    return float(np.sqrt(np.diagonal(tone.covariance).max()))
+    if isinstance(tone, Tone):
+        return float(np.sqrt(np.diagonal(tone.covariance).max()))
+    return float(np.sqrt(0.5 * (np.square(tone.cosine) + np.square(tone.sine)).max()))
 
 
-def words_of(tones: tuple[Tone, ...], rate_hz: float) -> str:
+def words_of(tones: Sequence[Tone | Hum], rate_hz: float) -> str:
     """Such as "14 um rms near 87 Hz", '' without tones; ``rate_hz``: samples per second."""
     return ', '.join(f'{_micrometres(rms_of(t))} rms near {t.frequency * rate_hz:.3g} Hz' for t in tones)
 
