@@ -46,6 +46,10 @@ _BIAS = 0.5
 _GAPS = 0.15
 """Times v_k of a block with gaps, added to tau_k^2: so uncertain is what such blocks say of the motion."""
 
+_BENT = 8e-4
+"""Times the slope's c_1^2, of blocks of two samples: their mean's error while they move with 0.025 cycles a sample. Two
+samples do not show how a motion bends."""
+
 _LASTING = 250.0
 """Blocks, at the most, of the mean of motion that goes on alike: 5 s of 20 samples at 1 kHz. Its error is a fifth of
 that of the short one, so that motion which bends a block by a fifth of its noise is distinguished from noise."""
@@ -60,8 +64,8 @@ _LASTING_BIAS = 0.03
 _SUDDEN = 16.0
 """c_k^2 over what the blocks before let expect of it, above which this block alone says how much motion there is."""
 
-_POOR_FIT = 5.0
-"""Standard deviations of the sum of squares that is left, above which the polynomial does not fit."""
+_POOR_FIT = 3.5
+"""Standard deviations of a normal distribution: chance alone makes a fit poor once in 4,300 of each combination."""
 
 _CONTRADICTED = 3.0
 """Standard deviations of the chi-square of all coefficients of a block with gaps above which they contradict what the
@@ -111,9 +115,10 @@ class FittedRun(NamedTuple):
 def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
     """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples.
 
-    Of 5 to 11 samples it is one for each two: a motion of 14 Hz and 0.3 mm bends them by more than their noise.
+    Of 5 to 11 samples it is one for each two: a motion of 14 Hz and 0.3 mm bends them by more than their noise. Of 3
+    and 4 samples it is a parabola, of 2 a line.
     """
-    orders = min(ORDER, (size - 1) // (2 if 5 <= size < 12 else 4)) + 1
+    orders = size if size < 4 else min(ORDER, max((size - 1) // (2 if size < 12 else 4), 2)) + 1
     u = np.asarray((np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5), dtype=np.float64)
     columns: list[FloatArray] = []
     column: FloatArray
@@ -169,7 +174,7 @@ def _terms(
 ) -> _Terms:
     """``usual_v`` (K, C): ``v`` of a whole block, None for one."""
     samples, orders = q.shape
-    reported = min(orders, (samples + 1) // 2)
+    reported = orders if usual_v is None else min(orders, (samples + 1) // 2)
     u = xp.einsum('ast,tk->ask', precision, q)
     information = xp.einsum('sj,ask->ajk', q, u)
     inverted = inverse(information[:, :reported, :reported])
@@ -307,11 +312,13 @@ class BlockFit:
             free = samples - reported
             # In units of the noise: a chi-square of n - K degrees of freedom.
             squares = xp.sum(z * observed[orders + reported :], 0) - xp.sum(observed[:reported] * c, 0)
-            over = squares > (free + _POOR_FIT * xp.root(2.0 * free) if free else np.inf)
+            over = squares > _poor_fit(free)
             if np.count_nonzero(over):
                 poor_fit = [any(row) for row in over.tolist()]
                 rest = z - xp.einsum('sk,kza->sza', terms.q[:, :reported], c)
                 missed += np.where(over, _WIDEN * _WIDEN * xp.sum(rest * rest, 0) / free, 0.0)
+            if self._size == 2:
+                missed += _BENT * motion[1]
             covariance[:, self._diagonal, self._diagonal] += missed
         vibrating: list[tuple[int, ...]] = [()] * blocks
         if self._vibrations:
@@ -490,6 +497,14 @@ def _solved(matrix: FloatArray, added: FloatArray, right: FloatArray) -> list[Fl
             x[i] = x[i] - rows[i][m] * x[m]
         x[i] = x[i] / rows[i][i]
     return x
+
+
+def _poor_fit(free: int) -> float:
+    """Return the sum of squares above which the polynomial does not fit (Wilson & Hilferty 1931)."""
+    if not free:
+        return np.inf
+    cube_root = 1.0 - 2.0 / (9.0 * free) + _POOR_FIT * FIXED.root(2.0 / (9.0 * free))
+    return free * cube_root * cube_root * cube_root
 
 
 def _precision(gamma: FloatArray, white: bool) -> FloatArray:
