@@ -13,6 +13,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.measure.uncertainty.block_fit import FittedBlock
 from psd_deflection.measure.uncertainty.combinations import Residual
@@ -153,7 +154,13 @@ def _common(a: float, b: float, within: float) -> float:
 
 
 NOISE, SEGMENT, SUMS = 'state.noise', 'state.noise_segment', 'state.sums_segment'
-VIBRATION, HUM, STEPS, PSDS = 'state.vibration', 'state.hum', 'state.converter_steps', 'state.psds.'
+VIBRATION, HUM, DRIFT, STEPS, PSDS = (
+    'state.vibration',
+    'state.hum',
+    'state.drift',
+    'state.converter_steps',
+    'state.psds.',
+)
 """Names of the state; ``PSDS`` goes on with the PSDs (from 0) of a set, such as "state.psds.0_1"."""
 
 
@@ -167,7 +174,7 @@ class BlockEstimator:
     """
 
     part = 'the fit and the noise of the dots'
-    prefixes = (NOISE, SUMS, VIBRATION, HUM, STEPS, PSDS)
+    prefixes = (NOISE, SUMS, VIBRATION, HUM, DRIFT, STEPS, PSDS)
 
     def __init__(self, rig: Rig, on_plate: bool = True, tilts: Tilts = 'none') -> None:
         """``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs."""
@@ -278,13 +285,18 @@ class BlockEstimator:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """Return what disturbs the last block: vibration, hum, motion that its polynomials cannot follow."""
+        """Return what disturbs the last block: vibration, hum, drift, motion that its polynomials cannot follow."""
         if self._fitted is None:
             return ()
         vibrates = f'vibrates: {self.vibrates}' if self.vibrating else ''
         hum = words_of(self.noise.hum, self._rig.converter.sample_rate_hz)
         moves = f'moves: faster than {self._size} samples show' if self._fitted.poor_fit else ''
-        return tuple(filter(None, (vibrates, f'hum: {hum}' if hum else '', moves)))
+        return tuple(filter(None, (vibrates, f'hum: {hum}' if hum else '', self._drift_words(), moves)))
+
+    def _drift_words(self) -> str:
+        slope = np.abs(self.noise.drift.slope)
+        rate = float(slope.max()) * self._rig.converter.sample_rate_hz / (SEGMENT_BLOCKS * self._size)
+        return f'drifts: {dot_names(len(slope) // 2)[int(slope.argmax())]}, {rate * 1e6:.2g} µm/s' if rate else ''
 
     def search_outliers(self, index: int, dots: tuple[float, ...], result: ConsistencyResult) -> None:
         """Take a block into the search for a wrong reading: each inconsistent one, of the others every tenth."""
@@ -348,7 +360,7 @@ class BlockEstimator:
             tones = tuple(v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist()))
             hum = tuple(v for h in self.noise.hum for v in (h.frequency, *h.cosine.tolist(), *h.sine.tolist()))
             rows = {NOISE: self.noise.state(), VIBRATION: tones, HUM: hum, SEGMENT: self.noise.segment()}
-            rows |= {SUMS: self.noise.sums(), STEPS: self._converter.state()}
+            rows |= {SUMS: self.noise.sums(), DRIFT: self.noise.drift.state(), STEPS: self._converter.state()}
             out |= {name: row for name, row in rows.items() if row}
         sets = {self.full.psds: self.full, **self._subsets}
         states = {**self._pending, **{psds: psd_set.state() for psds, psd_set in sets.items()}}
@@ -365,6 +377,8 @@ class BlockEstimator:
             sums = numbers(values, SUMS, 'sum signals of a segment') or ()
             self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or (), sums)
             self.noise.tones = _tones(numbers(values, VIBRATION, 'what vibrates') or (), 2 * len(self._rig.psds))
+            if drift := numbers(values, DRIFT, 'the drift of these readings'):
+                self.noise.drift.set_state(drift)
             self._use_noise()
         for name in values:
             if name.startswith(PSDS):

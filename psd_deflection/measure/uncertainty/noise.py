@@ -34,6 +34,7 @@ from psd_deflection.base.arithmetic.spectra import lagged_products
 from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis
 from psd_deflection.measure.uncertainty.combinations import Residual, combinations_of
+from psd_deflection.measure.uncertainty.drift import Drift
 from psd_deflection.measure.uncertainty.vibration import Hum, Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray
 
@@ -119,6 +120,7 @@ class StreamNoise:
         self._search: ToneSearch | None = None
         self.tones: tuple[Tone, ...] = ()
         self.hum: tuple[Hum, ...] = ()
+        self.drift = Drift(count, xp)
         self._average: FloatArray | None = None
         self._sure = np.ones(size)
         self._count = 0
@@ -179,6 +181,8 @@ class StreamNoise:
         segment = index // SEGMENT_BLOCKS
         if segment != self._segment:
             changed = self._close()
+            if segment > self._segment + 1:
+                self.drift.interrupt()
             self._segment = segment
         self._blocks.append((index, slots, dots))
         if self._search is not None:
@@ -284,6 +288,8 @@ class StreamNoise:
         sums, self._sums = self._sums, []
         size = self._size
         if sum(len(slots) for _, slots, _ in blocks) < _LEAST_SHARE * SEGMENT_BLOCKS * size:
+            if blocks:
+                self.drift.interrupt()
             return False
         start = self._segment * SEGMENT_BLOCKS
         places = np.concatenate([(index - start) * size + slots for index, slots, _ in blocks])
@@ -297,8 +303,13 @@ class StreamNoise:
         rough = _roughness(places, np.column_stack((moved, series)), self._q, self._xp)
         count = self._readings
         fixed = _covariance(lags[count:, count:], sure, self._xp)[0, 0]
-        self._classify(lags[:count, :count], sure, fixed, rough + self._least())
+        at_rest = self._classify(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()
+        if at_rest:
+            mean_sd = self.mean_sd() * self._xp.root(size / len(dots))
+            self.drift.add(self._xp.sum(dots, 0) / len(dots), mean_sd)
+        else:
+            self.drift.interrupt()
         return True
 
     def _without_hum(self, search: ToneSearch, places: IntArray, dots: FloatArray, sums: FloatArray) -> FloatArray:
@@ -312,9 +323,10 @@ class StreamNoise:
             self.hum += (hum,)
         return dots
 
-    def _classify(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> None:
-        """``gamma``, ``sure``: as measured, of a segment. ``fixed`` (N,): of the combination that does not move.
+    def _classify(self, gamma: FloatArray, sure: FloatArray, fixed: FloatArray, rough: FloatArray) -> bool:
+        """Take a segment into the average, if that may be; return whether the link was at rest.
 
+        ``gamma``, ``sure``: as measured, of a segment. ``fixed`` (N,): of the combination that does not move.
         ``rough``: of the combinations that move, the readings and the combination that does not, m^2.
         """
         moving, xp, least = self._moving, self._xp, self._least()
@@ -329,7 +341,7 @@ class StreamNoise:
                 self.at_rest = True
             else:
                 self._into_average(_guess(fixed, rough[len(moving) : -1] / fixed_rough), np.ones(self._size))
-            return
+            return still
         before = self._average if self._average is not None else gamma
         known = xp.einsum('ac,cdl,ad,l->a', moving, before, moving, self._mean_of) + least / self._size
         ratio = means / known
@@ -347,6 +359,7 @@ class StreamNoise:
         self._other = self._other + 1 if other else 0
         if self._other >= _PATIENCE:
             self._restart(before * (fixed_rough / self._rough), self._sure, fixed_rough)
+        return still
 
     def _restart(self, gamma: FloatArray, sure: FloatArray, rough: float) -> None:
         self._average, self._sure, self._rough = gamma, sure, rough
