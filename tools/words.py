@@ -18,8 +18,16 @@ rivals:alternatives lattice:value_grid gathered:buffered foretold:predicted coas
 suspect:candidate suspects:candidates judge:classify judges:classifies judged:classified whole:full
 freed:with_free turned:rotated
 """
-FINISHED: dict[str, str] = dict(re.findall(r'(\w+):(\w+)', _WORDS))
-FOREIGN = {'ConnectionRefusedError'}  # Names of other people.
+# These only as the whole of an identifier.
+_EXACT = """
+found:result one:item own:local kept:selected left:residual turn:rotation turns:rotations by:by_name others:peers
+near:close far:distant plateau:hold plateaus:holds some:subset counted:count beyond:excess misfit:state_mismatch
+due:next_time settled:converged behind:lag walk:random_walk restore:load_state_dict little:small spread:sd tell:notify
+wander:random_walk much:share
+"""
+FINISHED, EXACT = (dict(re.findall(r'(\w+):(\w+)', words)) for words in (_WORDS, _EXACT))
+# Names of other people: all of them, or what is before the name or after it.
+FOREIGN = {'ConnectionRefusedError', '.walk', '.tell', '.by', 'left=', 'kept='}
 # A test's name is a sentence in plain words.
 SENTENCE = re.compile('test_[a-z0-9]+_[a-z0-9]+_[a-z0-9_]+')
 ROOMS = ('psd_deflection', 'msg_adapters', 'launch', 'test', 'bench', 'blind', 'tools', 'bags')
@@ -27,14 +35,18 @@ ROOMS = ('psd_deflection', 'msg_adapters', 'launch', 'test', 'bench', 'blind', '
 
 def uses_of(text: str) -> Counter[str]:
     """Return the uses of each finished word in the identifiers of Python source ``text``."""
-    names = (t.string for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.NAME)
+    tokens = [t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.NAME]
+    names = [
+        t.string
+        for t in tokens
+        if not FOREIGN & {t.string, t.line[t.start[1] - 1 : t.end[1]], t.line[t.start[1] : t.end[1] + 1]}
+    ]
     parts = (
-        p.lower()
-        for n in names
-        if n not in FOREIGN and not SENTENCE.fullmatch(n)
-        for p in re.findall('[A-Z]+(?![a-z])|[A-Z]?[a-z]+', n)
+        p.lower() for n in names if not SENTENCE.fullmatch(n) for p in re.findall('[A-Z]+(?![a-z])|[A-Z]?[a-z]+', n)
     )
-    return Counter(p for p in parts if p in FINISHED)
+    # Beside what is right, left is a side.
+    sides = {'left'} if 'right' in names else set()
+    return Counter(p for p in parts if p in FINISHED) + Counter(n for n in names if n in EXACT.keys() - sides)
 
 
 if __name__ == '__main__':
@@ -42,5 +54,5 @@ if __name__ == '__main__':
     uses = {path: uses_of(path.read_text()) for path in files}
     for path, words in uses.items():
         for word, count in words.items():
-            print(f'{path}: {word}: {count} uses, write {FINISHED[word]}')
+            print(f'{path}: {word}: {count} uses, write {(FINISHED | EXACT)[word]}')
     sys.exit(any(uses.values()))

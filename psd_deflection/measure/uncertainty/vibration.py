@@ -260,11 +260,11 @@ def _filled(places: IntArray, series: FloatArray, length: int) -> FloatArray:
     ):
         u, x = at[inner].astype(np.float64), [places[k[inner]] for k in knots]
         out[at[inner]] = 0.0
-        for k, own in zip(knots, x, strict=True):
+        for k, knot in zip(knots, x, strict=True):
             weight = np.ones(len(u))
             for other in x:
-                if other is not own:
-                    weight *= (u - other) / (own - other)
+                if other is not knot:
+                    weight *= (u - other) / (knot - other)
             out[at[inner]] += weight[:, None] * series[k[inner]]
     return out
 

@@ -57,8 +57,8 @@ def outliers(residual: FloatArray, least: float) -> BoolArray:
                 x[gone] = CubicSpline(at[~gone], residual[~gone, c])(at[gone])
             apart = _from_cubic(x)
             limit = FAR * max(_TO_SD * float(np.median(apart)), least)
-            suspect = maximum_filter1d(apart, 5) > limit
-            distance = np.where(suspect & ~gone, np.abs(x - median_filter(x, 5)), 0.0)
+            candidate = maximum_filter1d(apart, 5) > limit
+            distance = np.where(candidate & ~gone, np.abs(x - median_filter(x, 5)), 0.0)
             worst = (distance > 0.5 * limit) & (distance >= maximum_filter1d(distance, 5))
             if not worst.any():
                 break
