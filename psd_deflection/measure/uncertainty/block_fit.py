@@ -44,7 +44,8 @@ _BIAS = 0.5
 """Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
 
 _GAPS = 0.15
-"""Times v_k of a block with gaps, added to tau_k^2: so uncertain is what such blocks say of the motion."""
+"""Times what v_k of the last blocks is above that of a whole one, added to tau_k^2: so uncertain is what blocks with
+gaps say of the motion."""
 
 _BENT = 8e-4
 """Times the slope's c_1^2, of blocks of two samples: their mean's error while they move with 0.025 cycles a sample. Two
@@ -370,14 +371,13 @@ class BlockFit:
         square = c * c
         excess = square - terms.v
         recent = _recent_after(memory.recent, excess, terms.sure)
-        late = recent[:, 0] / np.maximum(recent[:, 1], 1e-12)
+        share = np.maximum(recent[:, 1], 1e-12)
+        late = recent[:, 0] / share
         # Of the noise and the motion of late.
         expected = usual_v[:reported] + np.maximum(late[1:, :reported], 0.0)
         lasting = _lasting_after(memory.lasting, excess, terms.sure, late[1:, :reported], expected)
-        bias = _BIAS * usual_v
-        if terms is not self._full:
-            bias[:reported] -= _GAPS * terms.v
-        usual = np.maximum(late - bias, 1e-9 * usual_v)
+        bias = _BIAS - _GAPS * (1.0 / np.sqrt(share) - 1.0)
+        usual = np.maximum(late - bias * usual_v, 1e-9 * usual_v)
         np.maximum(usual, lasting[:, 0] - _LASTING_BIAS * usual_v, out=usual)
         before, tau = usual[:-1], usual[1:].copy()
         sudden = square > _SUDDEN * (terms.v + before[:, :reported])
