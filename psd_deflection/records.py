@@ -309,7 +309,7 @@ class RigState(NamedTuple):
     ``changed``: the values of the :class:`ParameterChange` that it was sent for, {} if there was none.
     ``version``: of the software. ``t_ns``: time of the change, 0 at the start. ``made_with``: what computes
     (:mod:`psd_deflection.recordings.provenance`). ``memory``: what the pipeline remembers before block ``block``
-    (:meth:`psd_deflection.measure.pipeline.Pipeline.memory`), {} if that is nothing; None if it is not told.
+    (:meth:`psd_deflection.measure.pipeline.Pipeline.snapshot`), {} if that is nothing; None if it is not told.
     """
 
     t_ns: int

@@ -71,7 +71,7 @@ class CameraSettings:
         0.0,
         'rad',
         'about how far the image of the plate is turned clockwise',
-        name='camera.turn',
+        name='camera.rotation',
         minimum=-10.0,
         maximum=10.0,
         live=True,

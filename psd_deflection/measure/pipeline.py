@@ -271,10 +271,10 @@ class Pipeline:
 
     @property
     def buffers(self) -> int:
-        """How many numbers the unfinished noise segment adds to :meth:`memory`; 0 between two segments."""
+        """How many numbers the unfinished noise segment adds to :meth:`snapshot`; 0 between two segments."""
         return self.estimator.noise.buffered
 
-    def memory(self, rig: Rig) -> ParameterChange | None:
+    def snapshot(self, rig: Rig) -> ParameterChange | None:
         """The state that the next block depends on besides its samples and ``rig``; None if there is none.
 
         ``rig``: the rig as it was at the start; later changes are part of the memory. Nothing is changed by it.

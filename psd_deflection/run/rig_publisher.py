@@ -48,7 +48,7 @@ class RigPublisher:
 
     def _memory(self) -> ParameterChange:
         pipeline = self._session.pipeline
-        return pipeline.memory(pipeline.rig) or ParameterChange(0, 0, ())
+        return pipeline.snapshot(pipeline.rig) or ParameterChange(0, 0, ())
 
     def put(self, record: Record) -> None:
         """Take what the pipeline remembers after the block ``record``, if it is due."""

@@ -105,7 +105,7 @@ class Watcher:
             self._last_ns = t_ns
             if not self._segments or t_ns - self._segments[-1].began_ns >= SEGMENT_NS:
                 rig = self._pipeline.rig
-                segment = _Segment(rig, t_ns, self._pipeline.memory(rig), self.watch.load)
+                segment = _Segment(rig, t_ns, self._pipeline.snapshot(rig), self.watch.load)
                 with self._lock:
                     self._segments.append(segment)
                     self._forget_older(t_ns)

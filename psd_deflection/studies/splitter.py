@@ -56,7 +56,7 @@ class SplitterRule(NamedTuple):
 
     def tree(self) -> dict[str, str | float | bool]:
         """For JSON."""
-        return dict(zip(('words', 'value', 'limit', 'unit', 'kept'), self, strict=True))
+        return dict(zip(('words', 'value', 'limit', 'unit', 'satisfied'), self, strict=True))
 
 
 class LightPhase(NamedTuple):

@@ -142,7 +142,7 @@ def in_chunks(rig: Rig, samples: RawChunk, blocks: int) -> Iterator[str]:
         for record in pipeline.process(chunk):
             yield reported(record)
             if isinstance(record, SampleBlock) and record.index % 37 == 5:
-                yield repr(pipeline.memory(rig))
+                yield repr(pipeline.snapshot(rig))
     yield from map(reported, pipeline.flush())
 
 

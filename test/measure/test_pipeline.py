@@ -291,7 +291,7 @@ def test_before_the_first_block_a_change_is_of_block_0_at_time_0(rig: Rig) -> No
     assert Pipeline(drifts).temperature(21.5) == ParameterChange(0, 0, ((first, 21.5), (now, 21.5)))
     pipeline = Pipeline(drifts)
     pipeline.temperature(21.5)
-    memory = pipeline.memory(drifts)
+    memory = pipeline.snapshot(drifts)
     assert memory is not None
     assert (memory.t_ns, memory.block) == (0, 0)
     records = run(pipeline.process, chunk_of(still(REST, 40, 0)))

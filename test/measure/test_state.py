@@ -52,12 +52,12 @@ def ran(rig: Rig, blocks: int = 30) -> Pipeline:
 
 def test_every_value_belongs_to_one_part_and_comes_back() -> None:
     rig = load_rig(overrides=MODAL)
-    memory = ran(rig).memory(rig)
+    memory = ran(rig).snapshot(rig)
     assert memory is not None
     other = Pipeline(rig)
     other.apply(memory)
     assert other.mismatches == []
-    again = other.memory(rig)
+    again = other.snapshot(rig)
     assert again is not None
     reported = dict(memory.values)
     assert {name: reported[name] for name, _ in again.values} == dict(again.values)
@@ -69,7 +69,7 @@ def test_every_value_belongs_to_one_part_and_comes_back() -> None:
 @pytest.mark.parametrize('value', [(1.0,), 'words', 3.0, (float('nan'),)])
 def test_a_value_that_does_not_fit_is_named_with_its_part(name: str, value: float | str | tuple[float, ...]) -> None:
     rig = load_rig(overrides=MODAL)
-    memory = ran(rig).memory(rig)
+    memory = ran(rig).snapshot(rig)
     assert memory is not None
     wrong = {**dict(memory.values), name: value}
     pipeline = Pipeline(rig)
@@ -91,7 +91,7 @@ def test_a_value_of_no_part_is_named() -> None:
 
 def test_a_replay_says_what_it_cannot_go_on_from(tmp_path: Path) -> None:
     rig = load_rig(overrides=MODAL)
-    memory = ran(rig).memory(rig)
+    memory = ran(rig).snapshot(rig)
     assert memory is not None
     plain = load_rig()
     with BagWriter(tmp_path / 'bag', rig_values=plain.flat()) as bag:
@@ -195,7 +195,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(label: str) -> None:
     for start in case.starts:
         live, replay, without = (Pipeline(rig) for _ in range(3))
         list(live.process(streams.chunk(volts[: 20 * start])))
-        memory = live.memory(rig)
+        memory = live.snapshot(rig)
         assert memory is not None
         assert memory.block == start
         replay.apply(memory)
@@ -262,7 +262,7 @@ def test_what_is_known_of_the_surroundings_replays_to_the_bit(name: str) -> None
     list(live.process(streams.chunk(samples[:400])))
     live.temperature(24.0)
     list(live.process(streams.chunk(samples[400:600], 400)))
-    memory = live.memory(rig)
+    memory = live.snapshot(rig)
     assert memory is not None
     assert dict(memory.values)[name] == dict(zip(ENVIRONMENT, (0.0, 21.5, 24.0), strict=True))[name]
     rest = streams.chunk(samples[600:], 600)
@@ -279,7 +279,7 @@ def test_what_was_changed_is_remembered() -> None:
     live, replay = Pipeline(rig), Pipeline(rig)
     live.change({'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'twist_sd': 0.5})
     live.change({'twist_sd': rig.values['twist_sd'], 'frozen': 'reject'})  # type: ignore[dict-item]
-    memory = live.memory(rig)
+    memory = live.snapshot(rig)
     assert memory is not None
     wanted = {'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'frozen': 'reject'}
     assert dict(memory.values) == wanted
@@ -303,7 +303,7 @@ def test_a_memory_of_another_length_is_left_out_and_reported(name: str, value: t
     pipeline.apply(ParameterChange(0, 0, ((name, value),)))
     (message,) = pipeline.mismatches
     assert f'{name}: {len(value)} numbers; expected ' in message
-    assert pipeline.memory(rig) == fresh.memory(rig)
+    assert pipeline.snapshot(rig) == fresh.snapshot(rig)
     assert pipeline.estimation.zero_variances == ()
     samples = streams.chunk(volts(1, 1)[:200])
     assert list(map(str, pipeline.process(samples))) == list(map(str, fresh.process(samples)))

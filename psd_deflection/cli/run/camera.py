@@ -239,7 +239,7 @@ def _report(
                 'answers': good,
                 'rejected': rejected,
                 'sd': dict(zip(('dx', 'dy', 'theta'), median, strict=False)),
-                'turn': None if rest is None else reference.rotation,
+                'rotation': None if rest is None else reference.rotation,
                 'radius_scale': None if rest is None else rest.scale,
                 'lens': bool(settings.matrix),
             }

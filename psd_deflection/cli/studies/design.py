@@ -158,7 +158,7 @@ def splitter_of(args: argparse.Namespace) -> int:
 
 def rules_text(rules: Sequence[splitter.SplitterRule]) -> str:
     """A row for each rule."""
-    rows = [['rule', 'is', 'limit', 'unit', 'kept']]
+    rows = [['rule', 'is', 'limit', 'unit', 'satisfied']]
     for rule in rules:
         rows.append(
             [rule.words, f'{rule.value:.4g}', f'{rule.limit:.4g}', rule.unit, 'yes' if rule.satisfied else 'NO']

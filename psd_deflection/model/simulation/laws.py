@@ -123,7 +123,7 @@ FORMS: Mapping[str, Form] = {
     'signed_square': Form('static', '{v} |{v}|', apart=lambda v, _: v * np.abs(v), unit_of_v=2),
     'above': Form('static', 'max({v} - {threshold}, 0)', apart=law_forms.above, fitted={'threshold': ('v', *ANY)}),
     'below': Form('static', 'max({threshold} - {v}, 0)', apart=law_forms.below, fitted={'threshold': ('v', *ANY)}),
-    'beyond': Form(
+    'excess': Form(
         'static',
         'sign({v}) max(|{v}| - {threshold}, 0)',
         apart=law_forms.excess,

@@ -208,7 +208,7 @@ class Conformity(NamedTuple):
 
     def tree(self) -> dict[str, str]:
         """For JSON."""
-        return {'found': self.as_found, 'left': self.as_left}
+        return {'as_found': self.as_found, 'as_left': self.as_left}
 
 
 CONFORMS, FAILS, OPEN = 'conforms', 'does not conform', 'not decided'

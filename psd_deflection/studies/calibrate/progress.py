@@ -48,7 +48,7 @@ class ParameterProgress(NamedTuple):
     def tree(self) -> dict[str, Any]:
         """For JSON and for the live page."""
         names = {'name': self.name, 'words': self.words, 'value': self.value}
-        return {**names, 'left': self.sd_ratio, 'determined': self.determined, 'filled': self.filled}
+        return {**names, 'sd_ratio': self.sd_ratio, 'determined': self.determined, 'filled': self.filled}
 
 
 class Need(NamedTuple):

@@ -198,7 +198,7 @@ def _where_it_is(name: str, parts: Sequence[FloatArray], size: float) -> Iterato
         yield LawTerm('above', (name,), shapes={'threshold': level})
         yield LawTerm('below', (name,), shapes={'threshold': level})
     for share in (0.05, 0.15, 0.3, 0.5, 0.7):
-        yield LawTerm('beyond', (name,), shapes={'threshold': share * size})
+        yield LawTerm('excess', (name,), shapes={'threshold': share * size})
         yield LawTerm('within', (name,), shapes={'threshold': share * size})
     # Held loads take few values, and any threshold between two of them is the same.
     distinct = np.unique(np.concatenate(parts))

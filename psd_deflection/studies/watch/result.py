@@ -99,7 +99,10 @@ class WatchedRun(StudyResult):
             Column('since', np.array([self.since_s(a) for a in alarms], dtype=np.float64), 's', 'when it began'),
             [
                 Column(
-                    'seen', np.array([(a.observed_ns - self.start_ns) / 1e9 for a in alarms]), 's', 'when it was sure'
+                    'detected',
+                    np.array([(a.observed_ns - self.start_ns) / 1e9 for a in alarms]),
+                    's',
+                    'when it was sure',
                 ),
                 text_column('channel', [a.channel for a in alarms], 'what shifted'),
                 Column('shift', np.array([a.shift for a in alarms], dtype=np.float64), 'm, rad', 'by how much'),

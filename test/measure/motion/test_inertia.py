@@ -254,7 +254,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, run: moti
     for message in (reported.pop(0), reported.pop(0)):
         live.accelerate(message)
     with BagWriter(tmp_path / 'bag', rig_values=rig.flat()) as bag:
-        memory = live.memory(rig)
+        memory = live.snapshot(rig)
         assert memory is not None
         assert INERTIA in dict(memory.values)
         bag.put(memory)

@@ -78,7 +78,7 @@ def test_coasting_ends(operation: motion.Run) -> None:
     pipeline = Pipeline(motion.rig_of({'filter_coast': 0.2}))
     moved = through(pipeline, dark, range(300))
     assert moved[-1].block == 209
-    memory = pipeline.memory(pipeline.rig)
+    memory = pipeline.snapshot(pipeline.rig)
     assert memory is not None
     assert STATE not in dict(memory.values)
 
@@ -105,7 +105,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(operation: motion.Run
     live.load(AppliedLoad(0, 0.0, 0.0, 0.0))
     live.load(AppliedLoad(5_303_000_000, 3.0, 0.0, 0.0))
     through(live, dark, range(start))
-    memory = live.memory(RIG)
+    memory = live.snapshot(RIG)
     assert memory is not None
     expected = through(live, dark, range(start, 300))
     replay = Pipeline(RIG)

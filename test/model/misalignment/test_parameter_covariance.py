@@ -97,7 +97,7 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     after = estimates(records)['exact']
     assert before.covariance[0] ** 0.5 > 0.9e-6
     assert after.covariance[0] ** 0.5 < 0.5e-6
-    for reported in (change, pipeline.memory(rig)):
+    for reported in (change, pipeline.snapshot(rig)):
         assert isinstance(reported, ParameterChange)
         assert ZERO_VARIANCES in dict(reported.values)
     other = Pipeline(rig)
@@ -138,7 +138,7 @@ def test_systematic_covariance_of_filter_is_restored() -> None:
     rig = calibrated(filter='modal')
     live, replay, without = Pipeline(rig), Pipeline(rig), Pipeline(rig)
     list(live.process(chunk_of(still(rig, POSE, 200))))
-    memory = live.memory(rig)
+    memory = live.snapshot(rig)
     assert memory is not None
     reported = dict(memory.values)[SYSTEMATIC]
     assert live.estimation.systematic is not None

@@ -98,7 +98,7 @@ def test_a_lag_and_a_rate_are_those_of_their_equations() -> None:
 
 
 def test_a_law_of_what_a_reading_knows_is_corrected() -> None:
-    terms = (LawTerm('product', ('y1', 'temperature'), 2e-3), LawTerm('beyond', ('y1',), 0.05, {'threshold': 5e-5}))
+    terms = (LawTerm('product', ('y1', 'temperature'), 2e-3), LawTerm('excess', ('y1',), 0.05, {'threshold': 5e-5}))
     law = Law('odd', 'psd', 'y1', terms)
     observed = ForwardModel(RIG, active(law)).run(LOADS, WARM)
     true = ForwardModel(RIG, []).run(LOADS, WARM)

@@ -455,7 +455,7 @@ def test_the_bar_is_full_at_a_hundredth_of_the_tolerance(ratio: float, determine
 def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
     parameter = ParameterProgress(name='n', words='a', value='b', sd_ratio=0.1, determined=True)
     tree = CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree()
-    row = {'name': 'n', 'words': 'a', 'value': 'b', 'left': 0.1, 'determined': True, 'filled': parameter.filled}
+    row = {'name': 'n', 'words': 'a', 'value': 'b', 'sd_ratio': 0.1, 'determined': True, 'filled': parameter.filled}
     assert tree.pop('parameters') == [row]
     assert tree.pop('needs') == [{'motion': 'push', 'names': ('n',)}]
     assert tree == {'kind': 'reference', 'seconds': 2.0, 'determined': 1, 'rejected': 'too short'}

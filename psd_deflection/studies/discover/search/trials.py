@@ -32,7 +32,7 @@ class Limit:
 
     def tree(self) -> dict[str, str]:
         """For JSON."""
-        return {'limit': self.limit, 'beyond': self.further}
+        return {'limit': self.limit, 'further': self.further}
 
 
 @dataclass(frozen=True, slots=True)
