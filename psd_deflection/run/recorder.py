@@ -45,7 +45,7 @@ RECORD_ELSEWHERE = 'record elsewhere (parameter bag_dir)'
 QueuedMessage = tuple[str, str, bytes, int]  # Topic, type name, message encoded as CDR, log time in ns.
 QueueItem = QueuedMessage | ParameterChange | None  # None ends the recording.
 StateGetter = Callable[[Rig], ParameterChange | None]
-"""``Pipeline.snapshot``: the state that the pipeline carries over from earlier blocks, as a ParameterChange, or None."""
+"""``Pipeline.snapshot``: what the pipeline carries over from earlier blocks, as a ParameterChange, or None."""
 
 
 def new_folder(parent: Path, stem: str = 'psd') -> Path:
