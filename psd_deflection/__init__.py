@@ -417,16 +417,32 @@ def discover(
     return asked.discovered(asked.read(_several(recordings)))
 
 
-def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
+def discover_in(
+    plant: Plant | str | Path,
+    *,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    parts: str = '',
+    kinds: Mapping[str, str] | None = None,
+    noise: Sequence[float] = (),
+    seed: int = 0,
+) -> PlantDiscovery:
     """Name the effects that the simulation of ``plant``, a machine of yours, lacks to explain what was measured.
 
     ``plant``: a :class:`psd_deflection.studies.discover.plants.Plant`, which has measured tables, a simulation and a
-    library of effects that may be missing. Search, rules and answer are those of :func:`discover`; ``save(folder)``
-    writes ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
-    :class:`psd_deflection.base.errors.ConfigError` if the plant contradicts itself.
+    library of effects that may be missing; or a CSV table, whose ``outputs`` are sums of terms of its ``inputs``, both
+    names of columns (``parts``, ``kinds``, ``noise``: see
+    :class:`psd_deflection.studies.discover.csv_plant.CsvPlant`). Search, rules and answer are those of
+    :func:`discover`; ``save(folder)`` writes ``result.json`` and a page, ``predict`` takes another plant or table. The
+    same ``seed`` gives the same answer. Raises :class:`psd_deflection.base.errors.ConfigError` if the plant contradicts
+    itself.
     """
+    from psd_deflection.studies.discover.csv_plant import CsvPlant
     from psd_deflection.studies.discover.plant_search import discover_in as of_plant
+    from psd_deflection.studies.discover.plants import Plant
 
+    if not isinstance(plant, Plant):
+        plant = CsvPlant(plant, inputs, outputs, parts, kinds, noise)
     return of_plant(plant, seed=seed)
 
 

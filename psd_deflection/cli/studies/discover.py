@@ -22,6 +22,10 @@ apart, each from which size on, and what imitates it. LOADS are words as in simu
 REC may also be a table of readings: a .csv with one row for each load that was hung on the link, and no times. Such
 tables have no set-up check, law or --next.
 
+A table of another machine: --inputs and --outputs name its columns, and the answer is which terms of the inputs
+(powers, sines and cosines of angles, products) the outputs follow. Rows with the same text in column --parts are held
+out together.
+
 All REC together are one experiment. With --each every REC, or .yaml list, is one for itself: DIR/REC gets its files, or
 X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
 
@@ -30,6 +34,7 @@ X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings
   psd-deflection discover odd.csv --out found --next --limit lengths=0.4,0.5
   psd-deflection discover 'archive/*' --each --executor processes --out found
   psd-deflection discover --isolable thesis:1 --out before
+  psd-deflection discover mount.csv --inputs 'az [deg],el [deg]' --outputs 'error [arcsec]' --parts star --out terms
 """
 
 import argparse
@@ -69,11 +74,13 @@ from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.conclusion import adopting_folder
+from psd_deflection.studies.discover.csv_plant import CsvPlant
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LISTED, SCRIPT, LoopResult, planned, recorded_name, run_loop
 from psd_deflection.studies.discover.planning import Plan
+from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 
@@ -253,6 +260,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME',
         help='if a law is found, write it as the effect NAME to the folder of your effects and into model.yaml',
     )
+    group = parser.add_argument_group('a table of another machine')
+    group.add_argument('--inputs', metavar='COLUMN,...', help='columns that may determine the outputs')
+    group.add_argument('--outputs', metavar='COLUMN,...', help='columns that were measured')
+    group.add_argument('--parts', metavar='COLUMN', default='', help='rows with the same text are held out together')
     _next_arguments(parser)
     parser.epilog = _NEXT_HELP
     span_options(parser)
@@ -268,6 +279,8 @@ def run(args: argparse.Namespace) -> int:
         return _before(args, asked)
     if not args.recordings:
         raise UsageError('REC: needed: one recording or several; --isolable LOADS needs none')
+    if args.inputs or args.outputs:
+        return _in_csv(args)
     names = each_for_itself(args)
     if names is not None:
         reject(args, {'next': False}, 'is not for --each')
@@ -296,6 +309,18 @@ def run(args: argparse.Namespace) -> int:
         progress('report')
         files = discovery.files()
     return _answered(args, discovery, files, _hints(args, discovery))
+
+
+def _in_csv(args: argparse.Namespace) -> int:
+    """Search one table of another machine."""
+    if len(args.recordings) > 1 or not (args.inputs and args.outputs):
+        raise UsageError('--inputs, --outputs: both are needed, and one table')
+    reject(args, {'adopt': None, 'each': False, 'next': False, 'params_file': None}, 'is for recordings of the rig')
+    make_writable(args.out)
+    with stage('searching', quiet=args.quiet or args.json):
+        plant = CsvPlant(args.recordings[0], args.inputs.split(','), args.outputs.split(','), args.parts)
+        discovery = discover_in(plant, seed=args.seed)
+    return _answered(args, discovery, discovery.files(), [])
 
 
 def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -331,10 +332,12 @@ class PlantDiscovery(Conclusion):
         """Effect to values of the model that predicts best: named effects and nuisance, and what helps beyond them."""
         return as_model(self.predicting)
 
-    def predict(self, plant: Plant) -> list[FloatArray]:
+    def predict(self, plant: Plant | str | Path) -> list[FloatArray]:
         """What the model that predicts best says of ``plant``, of each case (channels, n): the same machine, perhaps in
-        cases that the search has not seen.
+        cases that the search has not seen. After a search in a CSV table: another table.
         """
+        if not isinstance(plant, Plant):
+            plant = self.workspace.plant.like(plant)
         return [np.asarray(rows, dtype=np.float64) for rows in plant.simulate_effects(self.predicting)]
 
 

@@ -3,6 +3,8 @@
 """What a machine that simulates itself tells of itself, so that :func:`discover_in` can ask it; and a table of readings
 as such a machine."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 from abc import ABC, abstractmethod
@@ -104,6 +106,10 @@ class Plant(ABC):
     def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:
         """What the search calls: :meth:`simulate`, unless a plant may have one effect several times."""
         return self.simulate({a.effect.name: dict(a.values) for a in effects})
+
+    def like(self, path: str | Path) -> Plant:
+        """Return the same machine with the measurements of another file. Raises ConfigError if it reads none."""
+        raise ConfigError(f'{path}: this machine is not read from files; pass a Plant')
 
     def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
         """Files by name that describe the machine with the ``effects`` found; they are saved with the answer."""

@@ -6,10 +6,12 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import psd_deflection
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.catalogue import make_active, with_effects
@@ -462,3 +464,31 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
 def test_volts_of_wrong_number_of_psds_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
         Observation('x', SIX, make_observation(THREE).volts, PUSHES)
+
+
+def test_terms_of_any_table_are_named_and_predict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng, names = np.random.default_rng(3), ['az [deg]', 'force [N]', 'way']
+    u = np.column_stack((rng.uniform(0.0, 360.0, 80), rng.uniform(10.0, 30.0, 80), rng.choice([-1.0, 1.0], 80)))
+    u[:2, 1] = 10.0, 30.0
+    y = 3.0 + 2.0 * np.sin(np.radians(u[:, 0])) - 1.5 * (0.1 * u[:, 1] - 2.0) ** 2 + 0.05 * rng.normal(size=80)
+    rows = [
+        ','.join([*map(str, values), '' if i == 7 else f'{v:.4f}', str(i // 4)])
+        for i, (values, v) in enumerate(zip(u, y, strict=True))
+    ]
+    for name, part in (('a.csv', rows[:60]), ('b.csv', rows[60:])):
+        (tmp_path / name).write_text('\n'.join([','.join([*names, 'd [mm]', 'day']), *part]))
+    asked: dict[str, Any] = {'inputs': names, 'outputs': ['d [mm]'], 'parts': 'day', 'kinds': {'way': 'sign'}}
+    discovery = psd_deflection.discover_in(tmp_path / 'a.csv', **asked)
+    assert {e.active.effect.name for e in discovery.effects} == {'d: sin az', 'd: force^2'}
+    (predicted,) = discovery.predict(tmp_path / 'b.csv')
+    assert np.sqrt(np.mean((predicted[0] - y[60:]) ** 2)) < 0.08
+    words = ['--inputs', ','.join(names), '--outputs', 'd [mm]', '--parts', 'day', '--out', str(tmp_path / 'out')]
+    assert main(['discover', str(tmp_path / 'a.csv'), *words]) == 0
+    assert 'd: sin az' in capsys.readouterr().out
+    options: dict[str, Any]
+    for options, message in (
+        ({'inputs': ['q']}, 'the header lacks q'),
+        ({'kinds': {'way': 'up'}}, "way = 'up': must be"),
+    ):
+        with pytest.raises((ConfigError, RecordingError), match=message):
+            psd_deflection.discover_in(tmp_path / 'a.csv', **{**asked, **options})

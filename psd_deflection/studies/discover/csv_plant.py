@@ -1,0 +1,151 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Any CSV table as a plant without a model: outputs as sums of terms of the inputs."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.base.csv_table import CsvTable
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.declaration import EffectParameter
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.plants import FOLDS, Model, Plant, plant_effect
+
+KINDS = ('number', 'degrees', 'radians', 'sign')
+"""Of an input: terms of its powers, of sine and cosine, or of its sign beside its powers."""
+
+_UNIT = re.compile(r'[\[(]([^\])]*)[\])]\s*$')
+_REACH = 20.0
+"""Largest size of a term, in standard deviations of the output."""
+
+
+class _Range(NamedTuple):
+    """Middle of an input, and half of its range: its scaled value is from -1 to 1."""
+
+    middle: float
+    half: float
+
+
+class CsvPlant(Plant):
+    """A table: ``outputs`` as an offset plus terms of the ``inputs``.
+
+    A number u is scaled to its range, v = (u - middle) / half, so that a size is what its term does at the ends of the
+    range, in the unit of the output: v, v^2, v^3. An angle has the terms sin, cos, sin 2u, cos 2u; a sign has sgn(u).
+    Products of two inputs' first terms are terms too. Units are in brackets in the header: "el [deg]".
+    """
+
+    cases = ('table',)
+
+    def __init__(
+        self,
+        path: str | Path,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        parts: str = '',
+        kinds: Mapping[str, str] | None = None,
+        noise: Sequence[float] = (),
+        ranges: Mapping[str, _Range] | None = None,
+    ) -> None:
+        """``parts``: a column; rows with the same text in it are left out of the fit together. ``kinds``: of an input,
+        one of ``KINDS``; a unit of deg or rad is recognised. ``noise``: rms of each output, if it is known.
+
+        Raises ConfigError for a name that the table lacks, RecordingError for a cell that is no number; an output's
+        cell may be empty.
+        """
+        table = CsvTable(Path(path))
+        table.require((*inputs, *outputs, *((parts,) if parts else ())), 'a table of inputs and outputs')
+        rows = list(table.table_rows())
+        if not inputs or not outputs or len(rows) < FOLDS:
+            raise ConfigError(f'{path}: {len(rows)} rows: needs inputs, outputs and at least {FOLDS} rows')
+        self.channels, self.noise = tuple(map(_bare, outputs)), tuple(noise)
+        self.units = tuple(_unit(name) for name in outputs)
+        self._arguments = (tuple(inputs), tuple(outputs), parts, dict(kinds or {}), tuple(noise))
+        self._inputs = {_bare(name): np.array([row.number(name) for row in rows]) for name in inputs}
+        self._outputs = np.array([[row.number(n) if row.text(n) else math.nan for row in rows] for n in outputs])
+        texts = (
+            [row.text(parts) for row in rows] if parts else list(map(str, np.arange(len(rows)) * FOLDS // len(rows)))
+        )
+        order = list(dict.fromkeys(texts))
+        self._parts: IntArray = np.array([order.index(text) for text in texts])
+        self._ranges = dict(
+            ranges or {n: _Range((u.min() + u.max()) / 2, np.ptp(u) / 2) for n, u in self._inputs.items()}
+        )
+        self._terms = self._terms_of({_bare(n): (kinds or {}).get(n) or _kind(n) for n in inputs})
+        sd = np.nanstd(self._outputs, axis=1) + 1e-300
+        effects = {
+            f'{output}: {term}': EffectParameter('size', unit, -_REACH * s, _REACH * s, s, f'{term} of {output}')
+            for output, unit, s in zip(self.channels, self.units, sd.tolist(), strict=True)
+            for term in ('offset', *self._terms)
+        }
+        self.library = tuple(plant_effect(n, p) for n, p in effects.items() if not n.endswith(': offset'))
+        self.nuisance = tuple(plant_effect(n, p) for n, p in effects.items() if n.endswith(': offset'))
+
+    def like(self, path: str | Path) -> CsvPlant:
+        """Return another table with the columns and the terms of this one."""
+        return CsvPlant(path, *self._arguments, ranges=self._ranges)
+
+    def measured(self) -> Sequence[FloatArray]:
+        """Return the outputs."""
+        return [self._outputs]
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        """Return the inputs."""
+        return {name: [values] for name, values in self._inputs.items()}
+
+    def parts(self) -> Sequence[IntArray]:
+        """Return the part of each row."""
+        return [self._parts]
+
+    def simulate(self, model: Model) -> Sequence[FloatArray]:
+        """Return the sum of the terms of ``model`` for each output."""
+        out = np.zeros((len(self.channels), len(self._parts)))
+        for name, values in model.items():
+            output, term = name.split(': ')
+            out[self.channels.index(output)] += values['size'] * (1.0 if term == 'offset' else self._terms[term])
+        return [out]
+
+    def _terms_of(self, kinds: Mapping[str, str]) -> dict[str, FloatArray]:
+        first, further = dict[str, dict[str, FloatArray]](), dict[str, FloatArray]()
+        for name, kind in kinds.items():
+            u, (middle, half) = self._inputs[name], self._ranges[name]
+            if kind not in KINDS:
+                raise ConfigError(f'kinds: {name} = {kind!r}: must be one of {", ".join(KINDS)}')
+            if half == 0.0:
+                continue  # A constant is in the offset.
+            if kind in ('degrees', 'radians'):
+                angle = np.radians(u) if kind == 'degrees' else u
+                first[name] = {f'sin {name}': np.sin(angle), f'cos {name}': np.cos(angle)}
+                further |= {f'sin 2 {name}': np.sin(2.0 * angle), f'cos 2 {name}': np.cos(2.0 * angle)}
+                continue
+            v = (u - middle) / half
+            first[name] = {name: v}
+            further |= {f'{name}^2': v**2, f'{name}^3': v**3}
+            if kind == 'sign':
+                further[f'sign {name}'] = np.sign(u)
+        products = {
+            f'{a} * {b}': x * y
+            for left_terms, right_terms in itertools.combinations(first.values(), 2)
+            for (a, x), (b, y) in itertools.product(left_terms.items(), right_terms.items())
+        }
+        return {k: v for terms in first.values() for k, v in terms.items()} | further | products
+
+
+def _unit(name: str) -> str:
+    match = _UNIT.search(name)
+    return match[1].strip() if match else ''
+
+
+def _bare(name: str) -> str:
+    return _UNIT.sub('', name).strip()
+
+
+def _kind(name: str) -> str:
+    return {'deg': 'degrees', '°': 'degrees', 'rad': 'radians'}.get(_unit(name), 'number')
