@@ -140,7 +140,7 @@ class EstimateSeries:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last estimate, and for the last one a step more (the median); 0 of fewer than two."""
+        """Seconds from the first estimate to the end of the last: one step more, the median; 0 of fewer than two."""
         steps = np.diff(self.t_ns)
         return float(steps.sum() + np.median(steps)) * 1e-9 if len(steps) else 0.0
 

@@ -186,7 +186,7 @@ def test_the_page_is_whole(tmp_path: Path) -> None:
     page = out.read_text()
     assert not re.search(r'(src|href)="(?!#)|\bimport\b[^(;]*from|@import|url\(', page)
     assert 'laser lost' in page
-    assert '52 blocks' in page
+    assert ('52 blocks' in page, len(re.findall(r' µm, median sd 0\.\d\d µm<', page))) == (True, 2)
     assert re.findall(r'<div id="plot_(\w+)">', page) == ['shift', 'theta', 'sums', 'spectrum']
     recorded = open_recording(BAGS / 'laser_off').estimates()['/link_tip/deflection']
     columns = content_of(out)['columns']
