@@ -59,7 +59,7 @@ def test_a_page_has_what_its_lines_of_pip_add() -> None:
         'docs/commands.md': ['shtab'],
         'docs/camera.md': ['opencv-python-headless>=4.6'],
         'docs/first-day.md': ['pandas'],
-        'docs/recording.ipynb': ['pandas>=2.1', 'xarray>=2024.1'],
+        'docs/recording.ipynb': ['matplotlib>=3.6', 'pandas>=2.1', 'xarray>=2024.1'],
         'docs/fleet.md': ['distributed>=2024.1', 'pyarrow>=15'],
     }
 
@@ -233,10 +233,10 @@ def test_no_page_loads_anything_from_elsewhere() -> None:
 NOTEBOOKS = sorted((ROOT / 'docs').glob('*.ipynb'))
 
 
-def outputs(notebook: Path) -> list[list[tuple[str, object]]]:
+def outputs(notebook: Path) -> list[list[tuple[Any, ...]]]:
     """Of each cell with code: the kinds of its outputs, and what it prints."""
     cells = [c for c in json.loads(notebook.read_text())['cells'] if c['cell_type'] == 'code']
-    return [[(o['output_type'], o.get('text') or sorted(o.get('data', {}))) for o in c['outputs']] for c in cells]
+    return [[(*o.get('data', {}), o.get('text') or o['data']['text/plain']) for o in c['outputs']] for c in cells]
 
 
 @pytest.mark.slow
