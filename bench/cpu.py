@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.live import BLOCKS_PER_S, Device
-from bench.rows import ROOT, Row, figure, keep, piped
+from bench.rows import BY_HAND, ROOT, Row, figure, keep, piped
 from blind.campaign import conclude, options
 
 RESULTS = ROOT / 'bench' / 'cpu.json'
@@ -200,7 +200,7 @@ def row_of(spent: dict[tuple[str, str], float], took: float, clocks: float) -> R
 def main() -> int:
     parser = options(__doc__)
     parser.add_argument('--seconds', type=float, default=20.0, help='of each window (default: 20)')
-    parser.add_argument('--results', type=Path, default=RESULTS)
+    parser.add_argument('--results', type=Path, default=BY_HAND / 'cpu.json')
     parser.add_argument('--node', help='of the child process: the port')
     parser.add_argument('--folder', help='of the child process: where it records')
     args = parser.parse_args()

@@ -27,7 +27,7 @@ from mcap_ros2.writer import Writer
 from scipy.signal import lsim
 
 from bench.live import make_recording
-from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, notify
+from bench.rows import BY_HAND, ROOT, Row, figure, in_turns, keep, notify
 from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.devices.protocol.frames import FrameDecoder, SampleFrame, encode
 from psd_deflection.measure.pipeline import Pipeline
@@ -401,7 +401,7 @@ def main() -> int:
     parser.add_argument('--seconds', type=float, default=60.0, help='of the recording that discover gets')
     parser.add_argument('--times', type=int, default=5)
     parser.add_argument('--only', choices=('frames', 'replay', 'conversion', 'simulation', 'discover', 'verdict'))
-    parser.add_argument('--results', type=Path, default=RESULTS)
+    parser.add_argument('--results', type=Path, default=BY_HAND / 'results.json')
     args = parser.parse_args()
     jobs: dict[str, Callable[[], list[Row]]] = {
         'frames': lambda: frames(args.times),

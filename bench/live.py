@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.rows import RESULTS, ROOT, Row, figure, keep, notify, piped
+from bench.rows import BY_HAND, ROOT, Row, figure, keep, notify, piped
 
 BLOCKS_PER_S = 50
 START_S = 4.0  # A process has imported rclpy and found the others.
@@ -399,7 +399,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=30.0, help='of the live measurement of each kind of node')
     parser.add_argument('--starts', type=int, default=5, help='times that the start is measured; 0: not at all')
-    parser.add_argument('--results', type=Path, default=RESULTS)
+    parser.add_argument('--results', type=Path, default=BY_HAND / 'results.json')
     parser.add_argument('--settle', type=float, default=5.0, help='seconds before each measurement')
     parser.add_argument('--rounds', type=int, default=2, help='in which it is done, so that a busy moment meets both')
     roles: dict[str, Callable[[], None]] = {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.rows import RESULTS, Row, figure, keep, notify, piped
+from bench.rows import BY_HAND, Row, figure, keep, notify, piped
 from psd_deflection.base.log import null_log
 
 SETTLE_S = 3.0
@@ -101,7 +101,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--most', type=int, default=64, help='rigs at most; 1, 2, 4 ... are tried')
     parser.add_argument('--seconds', type=float, default=10.0, help='of each measurement')
-    parser.add_argument('--results', type=Path, default=RESULTS)
+    parser.add_argument('--results', type=Path, default=BY_HAND / 'results.json')
     parser.add_argument('--role', choices=('devices', 'sessions'), help=argparse.SUPPRESS)
     parser.add_argument('--rigs', type=int, default=1, help=argparse.SUPPRESS)
     parser.add_argument('--ports', type=json.loads, help=argparse.SUPPRESS)

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What the benchmarks find: rows of ours, peers and limits, measured in turns, kept in ``bench/results.json``."""
+"""What the benchmarks find: rows of ours, peers and limits, measured in turns. ``bench/results.json``: of the page."""
 
 import importlib.metadata
 import json
@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / 'bench' / 'results.json'
+BY_HAND = ROOT / 'build' / 'bench'  # Where a bench leaves what it finds, unless --results names a file.
 PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas')
 
 
@@ -118,10 +119,11 @@ def notify(row: Row) -> None:
         print(words, flush=True)
 
 
-def keep(rows: Sequence[Row], path: Path = RESULTS) -> None:
+def keep(rows: Sequence[Row], path: Path) -> None:
     by_work = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
     by_work.update((row.work, row) for row in rows)
     tree = {'machine': machine(), 'rows': [asdict(row) for row in by_work.values()]}
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(tree, indent=1) + '\n', encoding='utf-8')
 
 

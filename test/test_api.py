@@ -235,7 +235,7 @@ def test_recordings_say_what_they_are() -> None:
     recording = psd_deflection.open(CLEAN)
     assert repr(recording) == f'<BagRecording {CLEAN}: device GOLDEN, parameters {len(recording.parameters)}>'
     assert len(recording.samples) == 4000
-    assert 'samples 4000, duration 3.999 s' in repr(recording)
+    assert 'samples 4000, duration 4.000 s' in repr(recording)
     html: Any = recording._repr_html_()
     assert '<th style="text-align:left">/psd/samples</th><td style="text-align:left">200</td>' in html
     recording.hello = {'serial': '<script>\x1b[2J'}

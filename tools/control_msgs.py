@@ -42,9 +42,16 @@ def installed(package: str = PACKAGE) -> bool:
     return importlib.util.find_spec(package) is not None
 
 
+def not_here() -> list[str]:
+    """What compiles it and is not on this machine."""
+    programs = [name for name in ('gcc', 'g++') if not shutil.which(name)]
+    header = Path(sysconfig.get_path('include')) / 'Python.h'
+    return programs if header.is_file() else [*programs, str(header)]
+
+
 def buildable() -> bool:
     """Whether compiler and generators are there."""
-    return shutil.which('g++') is not None and importlib.util.find_spec('rosidl_generator_py') is not None
+    return not not_here() and importlib.util.find_spec('rosidl_generator_py') is not None
 
 
 def available() -> bool:
@@ -150,5 +157,13 @@ def _run(*words: str) -> None:
         raise RuntimeError(f'{" ".join(words)}\n{done.stderr[-4000:]}')
 
 
+def main(package: str = PACKAGE) -> int:
+    """Print where it is; SystemExit with what to install, if it cannot be compiled here."""
+    if missing := not_here():
+        raise SystemExit(f'{package}: cannot be compiled without {", ".join(missing)}: apt install gcc g++ python3-dev')
+    print(built(package))
+    return 0
+
+
 if __name__ == '__main__':
-    print(built(*sys.argv[1:]))
+    sys.exit(main(*sys.argv[1:]))

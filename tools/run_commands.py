@@ -3,7 +3,7 @@
 """Runs the commands and the Python of README and docs as a reader would: ``make docs STEP=commands``.
 
 ``--clean``: in the environment that the pages tell a reader to make, without the tools of the tests: what `make run`
-installs, and on a page what that page's lines of pip add.
+installs, and on a page what that page's lines of pip add. A notebook has only what its own line of pip installs.
 """
 
 import configparser
@@ -21,7 +21,7 @@ import tempfile
 import time
 import tomllib
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -178,19 +178,28 @@ TRIED_ALONE = frozenset({'rerun'})  # `make demo NAME=rerun` has an environment 
 
 
 def extras_of(page: str) -> list[str]:
-    """The packages that the lines of pip of ``page`` add to what `make run` installs."""
-    setup = configparser.ConfigParser()
-    setup.read(ROOT / 'setup.cfg')
+    """The packages that the lines of pip of ``page`` add to what its reader has."""
     wanted = []
     for match in PIP.finditer((ROOT / page).read_text(encoding='utf-8')):
         wanted += [match['package']] if match['package'] else []
-        for extra in set((match['extras'] or '').split(',')) - {*BASE, *TRIED_ALONE, ''}:
-            wanted += setup['options.extras_require'][extra].split()
+        wanted += required(set((match['extras'] or '').split(',')) - {*base_of(page), *TRIED_ALONE, ''})
     return sorted(set(wanted))
+
+
+def required(extras: Iterable[str]) -> list[str]:
+    """What setup.cfg requires for them."""
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    return [package for extra in extras for package in setup['options.extras_require'][extra].split()]
 
 
 BASE = ('ros', 'monitor', 'plot')
 """The extras that `make run` installs."""
+
+
+def base_of(page: str) -> tuple[str, ...]:
+    """The extras that the reader of ``page`` has: whoever runs a notebook in a folder has no `make run`."""
+    return () if page.endswith('.ipynb') else BASE
 
 
 def python_of(page: str, folder: Path) -> list[str]:
@@ -260,14 +269,21 @@ class CleanRoom:
 
     @contextlib.contextmanager
     def page(self, name: str) -> Iterator[None]:
-        """Have what the lines of pip of the page ``name`` add, until its end."""
+        """Have what the lines of pip of the page ``name`` add, and a notebook nothing else, until its end."""
         wanted = extras_of(name)
+        without = [] if base_of(name) else [package for package in required(BASE) if package not in wanted]
+        self._uninstall(re.split(r'[\[<>=]', package)[0] for package in without)
         if wanted:
             install(wanted, str(self._venv))
         yield
-        more = self._installed().keys() - self._base.keys()
-        if more:
-            pip = [f'{self._venv}/bin/python', '-m', 'pip', 'uninstall', '--quiet', '--yes', *sorted(more)]
+        self._uninstall(sorted(self._installed().keys() - self._base.keys()))
+        if without:
+            install(without, str(self._venv))
+
+    def _uninstall(self, packages: Iterable[str]) -> None:
+        names = [*packages]
+        if names:
+            pip = [f'{self._venv}/bin/python', '-m', 'pip', 'uninstall', '--quiet', '--yes', *names]
             subprocess.run(pip, check=True)
 
     @contextlib.contextmanager

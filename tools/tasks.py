@@ -65,7 +65,7 @@ def bench(words: list[str]) -> int:
     for module, (look, short) in BENCH.items():
         arguments = '' if full else short if shortest else look
         results = {'cpu': 'cpu.json', 'solvers': '', 'accuracy': ''}.get(module, 'results.json')
-        into = f'--results {out / results}' if results and not full else ''
+        into = f'--results {out / results}' if results else ''
         status = shell(f'python -m bench.{module} {arguments} {into}')
         if status:
             return status

@@ -140,8 +140,9 @@ class EstimateSeries:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last estimate."""
-        return float(self.t_ns[-1] - self.t_ns[0]) * 1e-9 if len(self) else 0.0
+        """Seconds from the first estimate to the end of the last: one step more, the median; 0 of fewer than two."""
+        steps = np.diff(self.t_ns)
+        return float(steps.sum() + np.median(steps)) * 1e-9 if len(steps) else 0.0
 
     def to_pandas(self, *, clock: bool = False) -> pandas.DataFrame:
         """One row an estimate over ``t`` (s), or over the time of day in UTC if ``clock``; ``.attrs['units']``: units.

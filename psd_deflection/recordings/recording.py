@@ -142,8 +142,8 @@ class Recording(abc.ABC):
 
     @property
     def duration(self) -> float:
-        """Seconds from the first to the last sample, by their stamps."""
-        return float(self.samples['t'][-1])
+        """Seconds that the samples last, by their stamps: to the end of the last one."""
+        return self.lasts(*self.samples['t_ns'][[0, -1]].tolist())
 
     @overload
     def __getitem__(self, part: str) -> npt.NDArray[Any]: ...

@@ -180,7 +180,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'node': recording.node,
         'device_hello': recording.hello,
         'start_ns': first[1],
-        'duration_s': (last[1] - first[1]) * 1e-9,
+        'duration_s': recording.lasts(first[1], last[1]) if samples else 0.0,
         'samples': samples,
         'lost': recording.lost(first[0], last[0], samples) if samples else 0,
         'dropped_here': {'samples': recording.dropped_here[0], 'messages': recording.dropped_here[1]},

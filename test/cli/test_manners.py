@@ -531,7 +531,7 @@ def test_a_recording_with_a_typing_error_is_found(capsys: Capsys) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('command', ['replay', 'plot'])
+@pytest.mark.parametrize('command', ['replay', 'plot', 'info'])
 def test_how_long_a_recording_lasts_is_by_its_stamps(command: str, tmp_path: Path, capsys: Capsys) -> None:
     """At 200 Hz, with the rig file of 1000 Hz."""
     path = tmp_path / 'run.csv'

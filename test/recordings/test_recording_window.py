@@ -418,7 +418,7 @@ def test_a_table_has_the_columns_that_there_are() -> None:
 def test_a_summary_says_how_long_and_how_far() -> None:
     assert dict(series()._summary()) == {
         'estimates': '3',
-        'duration': '0.04 s',
+        'duration': '0.06 s',
         'ΔX': '+0.00 … +6.00 µm',
         'ΔY': '+1.00 … +7.00 µm',
         'θ': '+0.11 … +0.46 mdeg',
@@ -466,7 +466,7 @@ def test_a_recording_has_length_duration_and_start() -> None:
     assert recording
     assert 'samples' not in recording.__dict__
     assert (len(recording), recording.start) == (4000, datetime(2026, 1, 1, tzinfo=UTC))
-    assert recording.duration == pytest.approx(3.999)
+    assert recording.duration == pytest.approx(4.0)
     assert (recording['x1'] == recording.samples['x1']).all()
     with pytest.raises(KeyError, match="no column 'x3'; there are t, seq, t_ns, x1"):
         recording['x3']
@@ -478,7 +478,7 @@ def test_times_that_do_not_count_from_the_epoch_have_no_start() -> None:
 
 def test_estimates_have_duration_columns_and_times_of_day() -> None:
     estimates = psd_deflection.replay(CLEAN)
-    assert estimates.duration == pytest.approx(3.98)
+    assert estimates.duration == pytest.approx(4.0)
     assert (estimates['dx'] == estimates.dx).all()
     with pytest.raises(KeyError, match="no column 'dz'"):
         estimates['dz']

@@ -5,6 +5,7 @@
 The estimates are computed as by `replay`, with the recorded parameters or those of --params-file. Known
 loads, references, marks and zeros of the recording are drawn too. The ending of --out sets the format: .png,
 .svg, .pdf, or .html: one self-contained page with values under the cursor and zoom.
+`median sd` is the median of the standard deviations that the estimates state.
 
   psd-deflection plot bags/lost_samples
   psd-deflection plot bags/clean --from 1.5 --to 3
@@ -296,7 +297,7 @@ def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
     for name, label, scale, unit in _POSE:
         if name in f:
             low, high, sd = (f[name][k] * scale for k in ('min', 'max', 'sd'))
-            rows.append((label, f'{low:+.2f} … {high:+.2f} {unit}, sd {sd:.2f} {unit}'))
+            rows.append((label, f'{low:+.2f} … {high:+.2f} {unit}, median sd {sd:.2f} {unit}'))
     return rows
 
 
@@ -326,7 +327,7 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
                 t, value - 2 * sd, value + 2 * sd, color=COLORS[key], alpha=0.3, linewidth=0, rasterized=raster
             )
             axes.plot(t, value, color=COLORS[key], linewidth=0.8, rasterized=raster)
-            typical = f', band ±2 sd, sd {np.nanmedian(sd):.2f} {unit}' if np.isfinite(sd).any() else ''
+            typical = f', band ±2 sd, median sd {np.nanmedian(sd):.2f} {unit}' if np.isfinite(sd).any() else ''
             axes.set_ylabel(f'{label} ({unit})')
             axes.set_title(f'{label}{typical}', loc='left', fontsize=9)
             _mark_losses(axes, table)

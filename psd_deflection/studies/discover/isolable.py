@@ -32,7 +32,7 @@ from psd_deflection.studies.study import PageSection, StudyResult
 
 ALIKE = 1e-5
 """sin² below which two signatures are one: what is left of 32-bit signatures is rounding."""
-FROM_READINGS = ('spectral', 'line', 'value_grid')
+FROM_READINGS = ('spectral', 'line', 'value_grid', 'value_grid_dots')
 """Proposals that only readings can make."""
 
 

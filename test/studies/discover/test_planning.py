@@ -318,7 +318,7 @@ def test_it_says_what_a_search_cannot_separate() -> None:
 
 @pytest.mark.slow
 def test_what_does_not_show_is_listed_with_what_it_needs() -> None:
-    assert answer().hidden['refraction'] == 'a change of temperature'
+    assert set(answer().hidden.values()) == {'a change of temperature'}  # Not 'nothing', of coarse steps.
     still = isolable(RIG, np.zeros((2000, 3)), 'no load')
     assert 'bending_stiffness (moves_frequency 1)' in still.hidden
     # Where a PSD is shows without any load.
