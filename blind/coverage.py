@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import poisson
 
 from blind import generator
 from blind import motion as moving
@@ -156,7 +157,7 @@ def inside(error: Array, covariance: Array, named: npt.NDArray[np.bool_] | None 
     outliers = (size > 3.0).any(axis=1)
     reported = float(named[outliers].mean()) if outliers.any() else float('nan')
     errors = size[~named].size
-    chance = bool((size[~named] > 3.0).sum() <= BEYOND_3 * errors + 3.0 * (BEYOND_3 * errors) ** 0.5)
+    chance = bool((size[~named] > 3.0).sum() <= poisson.ppf(1.0 - BEYOND_3 / 2.0, BEYOND_3 * errors))
     three = float((size < 3.0).mean())
     shares = float((joint < CHI_SQUARE_3).mean()), three
     return Inside((a, b, c), *shares, (x, y, t), len(error), (u, v, w), float(named.mean()), reported, chance)

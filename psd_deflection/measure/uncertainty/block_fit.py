@@ -116,10 +116,10 @@ class FittedRun(NamedTuple):
 def basis(size: int, xp: Arithmetic = FIXED) -> FloatArray:
     """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples.
 
-    Of 5 to 11 samples it is one for each two: a motion of 14 Hz and 0.3 mm bends them by more than their noise. Of 3
+    Of 5 to 16 samples it is one for each two: a motion of 14 Hz and 0.3 mm bends them by more than their noise. Of 3
     and 4 samples it is a parabola, of 2 a line.
     """
-    orders = size if size < 4 else min(ORDER, max((size - 1) // (2 if size < 12 else 4), 2)) + 1
+    orders = size if size < 4 else min(ORDER, max((size - 1) // (2 if size < 17 else 4), 2)) + 1
     u = np.asarray((np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5), dtype=np.float64)
     columns: list[FloatArray] = []
     column: FloatArray
