@@ -351,14 +351,8 @@ def test_the_best_of_each_variant_is_tried() -> None:
     def score(name: str, gain: float, dof: int = 1) -> Any:
         return SimpleNamespace(gain=gain, dof=dof, candidate=SimpleNamespace(variant=(name,)))
 
-    scores = [
-        score('a', 100.0),
-        score('a', 90.0),
-        score('b', 60.0, 9),
-        score('c', 55.0),
-        score('d', 29.0),
-        score('e', 31.0),
-    ]
+    gains = (100.0, 90.0, 60.0, 55.0, 29.0, 31.0)
+    scores = [score(name, gain, 9 if name == 'b' else 1) for name, gain in zip('aabcde', gains, strict=True)]
     assert [s.candidate.variant[0] for s in promising(scores, 3.0, 0.3, 9)] == ['a', 'c', 'b', 'e']
     assert len(promising(scores, 3.0, 0.3, 2)) == 2
     assert promising([score('a', 0.0)], 3.0, 0.0, 9) == []
@@ -373,11 +367,8 @@ def test_a_plan_says_what_it_separates() -> None:
     piece, other = Piece('push', ('constant:0,-5,0:3',)), Piece('wait', ('constant:0,0,0:1', 'constant:0,0,0:2'))
     limits = Limits(seconds=30.0)
     warm = Setting('while it is warm', {'link.length': 0.4}, 5.0)
-    reports = (
-        reported_of('damping', 30.0, 40.0, 50.0),
-        reported_of('tip_mass', 90.0, 22.0, 99.0),
-        reported_of('x', 1.0, 2.0, 21.5),
-    )
+    rows = ('damping', 30.0, 40.0, 50.0), ('tip_mass', 90.0, 22.0, 99.0), ('x', 1.0, 2.0, 21.5)
+    reports = tuple(reported_of(*row) for row in rows)
     plan = Plan(warm, (piece, piece, other), reports, limits, 500.0)
     assert plan.words == 'push, 2 times; then wait, while it is warm'
     assert plan.seconds == 9.0
@@ -401,14 +392,8 @@ def test_a_plan_says_what_it_separates() -> None:
     assert tree['celsius'] == warm.knots
     assert idle.tree()['celsius'] is None
     assert (tree['seconds'], tree['sample_rate_hz'], tree['overrides']) == (9.0, 500.0, {'link.length': 0.4})
-    assert tree['rivals'][1] == {
-        'name': 'tip_mass',
-        'instead_of': 'creep',
-        'separation': 90.0,
-        'reverse': 22.0,
-        'possible': 99.0,
-        'separable': True,
-    }
+    names = ('name', 'instead_of', 'separation', 'reverse', 'possible', 'separable')
+    assert tree['rivals'][1] == dict(zip(names, ('tip_mass', 'creep', 90.0, 22.0, 99.0, True), strict=True))
     assert (tree['useful'], tree['loads'], tree['limits']['seconds']) == (True, plan.script, 30.0)
     assert [reported_of('x', 0.0, 0.0, p).separable for p in (21.5, 21.6)] == [False, True]
     assert Suggestion('do', 21.7).text == 'do: in simulation this separates them by 4.7 standard deviations'
@@ -779,13 +764,7 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
     alternative = Alternative(named.active, {'angle': 1e-3}, 4.0, study.fit)
-    listed_alternatives = dataclasses.replace(
-        study, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),)
-    ).tree()
-    assert listed_alternatives['effects'][0]['rivals'] == [
-        {
-            'name': 'sensor_rotation',
-            'parameters': {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}},
-            'delta_bic': 4.0,
-        }
-    ]
+    more = dataclasses.replace(study, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),))
+    parameters = {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}}
+    rival = {'name': 'sensor_rotation', 'parameters': parameters, 'delta_bic': 4.0}
+    assert more.tree()['effects'][0]['rivals'] == [rival]

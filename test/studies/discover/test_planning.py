@@ -224,22 +224,12 @@ def test_the_command_settles_what_one_length_leaves_open(
     assert (observed.name, observed.rig.link.length) == (made['file'], 0.409)
 
 
-class Nothing:
-    """Stands for an answer that writes nothing."""
-
-    def files(self) -> dict[str, str]:
-        return {}
-
-    def tree(self) -> dict[str, object]:
-        return {}
-
-
 @pytest.mark.slow
 def test_a_plan_is_written_as_files_that_the_commands_take(
     plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     warm = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, swing=2.0))
-    files = loop.LoopResult(cast(Discovery, Nothing()), (), warm, None).files()
+    files = loop.LoopResult(cast(Discovery, SimpleNamespace(files=dict, tree=dict)), (), warm, None).files()
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     lines = how_to_record(warm, tmp_path)
