@@ -85,7 +85,7 @@ def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('rows', 'y', 'seed'), [(8, 0.02, 9), (8, 0.02, 10), (10, -0.0125, 0)])
+@pytest.mark.parametrize(('rows', 'y', 'seed'), [(8, 0.02, 9), (8, 0.02, 10), (10, -0.0125, 0), (10, -0.0125, 4)])
 def test_of_a_short_table_one_effect_is_named_and_nothing_more(rows: int, y: float, seed: int) -> None:
     loads = LOADS[[0, 1, 2, 3, *([4, 5] if rows == 10 else []), 6, 7, 8, 11]]
     gain = make_active('sensor_gain', {'psd': 2, 'y': y}, 'test')
