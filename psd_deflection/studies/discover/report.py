@@ -277,8 +277,10 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     of_rig = discovery if isinstance(discovery, RigConclusion) else None
     out = [PageSection('', (_waterfall(discovery),))]
     if of_rig is not None and of_rig.setup:
-        wrong = [(f.name, f.where, _value(f), f.fix) for f in of_rig.setup]
-        out.append(PageSection('Set-up', (table(('mistake', 'where', 'value', 'what puts it right'), wrong),)))
+        wrong = [(f.name, f.where, _value(f), f.fix, ', '.join(f.equivalent)) for f in of_rig.setup]
+        head = ('mistake', 'where', 'value', 'what puts it right', 'explains it as well')
+        most = len(head) if any(f.equivalent for f in of_rig.setup) else -1
+        out.append(PageSection('Set-up', (table(head[:most], [row[:most] for row in wrong]),)))
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))
     law = [] if of_rig is None or of_rig.law is None else _law_section(of_rig, of_rig.law)

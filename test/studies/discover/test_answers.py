@@ -458,14 +458,8 @@ def test_what_remains_is_reported_in_words() -> None:
         )
         assert ('hysteretic' in unknown_of(left_with(dependences=depends), 0.0)[0].signature) == lagging
     # Twice as much of one kind is most of it.
-    for even, word in (
-        (20.1, 'mostly even'),
-        (20.0, 'odd and even parts'),
-        (5.0, 'odd and even parts'),
-        (19.9, 'odd and even parts'),
-        (5.1, 'odd and even parts'),
-        (4.9, 'mostly odd'),
-    ):
+    both = dict.fromkeys((20.0, 19.9, 5.1, 5.0), 'odd and even parts')
+    for even, word in {20.1: 'mostly even', **both, 4.9: 'mostly odd'}.items():
         depends = (Dependence('x2', 'dot_x^2', even, 1e-9), Dependence('x2', 'dot_x', 10.0, 1e-9))
         assert word in unknown_of(left_with(dependences=depends), 0.0)[0].signature
     # What coarse steps do varies with the signal: a fiftieth of what they explain is nothing else.
@@ -484,15 +478,8 @@ def test_a_gap_that_remains_is_never_left_unreported() -> None:
 
 
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
-    full = {
-        'sd': {},
-        'p': 1e-9,
-        'delta_bic': 50.0,
-        'heldout': HeldOut(20.0, 2.0),
-        'equivalent': (),
-        'fitted_alternatives': (),
-    }
-    return NamedEffect(active, **{**full, 'alternatives': (), 'suggestion': None, **given})
+    full = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': ()}
+    return NamedEffect(active, **{**full, 'fitted_alternatives': (), 'alternatives': (), 'suggestion': None, **given})
 
 
 def test_numbers_of_json_are_finite() -> None:
@@ -753,6 +740,14 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
         'sensor_rotation (psd 2) is missing from the model besides; adding it and putting the set-up right together '
         f'close the gap from {before} to {after}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
+    length = Finding('link_length', 'link.length', 1.02, 'link.length: 0.5967', 0.0, ('creep', 'sensitivity'))
+    alike = dataclasses.replace(study, setup=(length,))
+    assert 'recording says, or one effect is missing: link length (link.length; or creep, sens' in alike.sentence
+    others = '(or creep, sensitivity: this data cannot tell)'
+    assert alike.lines()[1] == f'set-up: link_length link.length {others}: link.length: 0.5967'
+    assert '<td>creep, sensitivity</td>' in alike.files()['report.html']
+    mistakes = dataclasses.replace(study, setup=(dataclasses.replace(length, equivalent=('sensitivity',)),)).sentence
+    assert 'says: link length (link.length; or sensitivity: this data cannot tell). sensor_rotation' in mistakes
     unannotated = Finding('load_coverage', late.where, 0.5, 'note it')
     partly = {'verdict': 'unknown_effect', 'unknown': (Unknown('', (), 0.5),)}
     described = sentence(setup=(unannotated,), **partly)

@@ -212,6 +212,10 @@ def test_the_command_settles_what_one_length_leaves_open(
 ) -> None:
     limits = ['--limit', 'swing=0', '--limit', 'sweep=0', '--limit', 'seconds=12', '--quiet']
     truth = ['--effect', 'clamp_bending_compliance,compliance=2e-7']
+    command = ['discover', str(soft), '--without', 'creep', '--from', '0.0', '--out', str(tmp_path)]
+    assert main([*command, '--quiet']) == 0
+    planning = f'next: {shlex.join(["psd-deflection", *command, "--next"])} plans the recording that tells '
+    assert f'{planning}link_length from clamp_bending_compliance, ' in capsys.readouterr().out
     assert main(['discover', str(soft), '--out', str(tmp_path), '--next', '--run', *truth, *limits]) == 0
     assert 'The answer is unique after 1 more recording.' in capsys.readouterr().out
     tree = json.loads((tmp_path / 'result.json').read_text())
