@@ -26,7 +26,7 @@ from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
-from psd_deflection.studies.discover.hidden import RIG_NUMBERS
+from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP
 from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.redundant import STAGES
 from psd_deflection.studies.discover.search.comparison import Comparison
@@ -412,7 +412,7 @@ def _setup(discovery: RigConclusion) -> str:
         name = f.name.replace('_', ' ')
         place = ', '.join(filter(None, (_place(f), _seconds(f))))
         where.setdefault(name, {}).update({place: None} if place else {})
-        alternatives.setdefault(name, {}).update(dict.fromkeys(f.equivalent))
+        alternatives.setdefault(name, {}).update(dict.fromkeys(other_causes(f)))
     names = []
     for name, places in where.items():
         others = [or_else(alternatives[name])] if alternatives[name] else []
@@ -428,9 +428,14 @@ def or_else(others: Iterable[str]) -> str:
     return f'or {", ".join(others)}: this data cannot tell'
 
 
+def other_causes(finding: Finding) -> list[str]:
+    """Mistakes and effects, by name, that explain the recordings as well; another wiring needs more changes."""
+    return [name for name in finding.equivalent if name in SETUP or name in effect_names()]
+
+
 def _setup_line(finding: Finding) -> str:
     """A mistake of the set-up, what else it may be, and what puts it right, in a line."""
-    others = f'({or_else(finding.equivalent)})' if finding.equivalent else ''
+    others = f'({or_else(causes)})' if (causes := other_causes(finding)) else ''
     return f'set-up: {" ".join(filter(None, (finding.name, _place(finding), others)))}: {finding.fix}'
 
 

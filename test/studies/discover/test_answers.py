@@ -725,7 +725,8 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
         f' close the gap from {before} to {after}, but their sizes are tied: '
         'one effect that is not in the catalogue is likelier.'
     )
-    setup = (Finding('channel_sign', 'y1', -1.0, 'x'), Finding('channel_sign', 'y1', -1.0, 'y'))
+    mirrored = Finding('channel_sign', 'y1', -1.0, 'y', 9.0, ('load_sign of fy',))
+    setup = (Finding('channel_sign', 'y1', -1.0, 'x'), mirrored)
     assert sentence(verdict='nothing_missing', effects=(), setup=setup) == (
         'The set-up is not as the rig file or the recording says: channel sign (y1). '
         f'Nothing is missing besides: the gap is {after}.'
