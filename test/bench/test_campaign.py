@@ -76,11 +76,11 @@ def test_damaged_frames_are_rejected(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_a_bench_by_hand_changes_no_tracked_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    kept: list[Path] = []
+    written: list[Path] = []
     monkeypatch.setattr(sys, 'argv', ['rigs', '--most', '1'])
     monkeypatch.setattr(rigs, 'measure', lambda *_: {'samples': 1000.0, 'lost': 0.0, 'share': 0.1})
-    monkeypatch.setattr(rigs, 'keep', lambda _, path: kept.append(path))
-    assert (rigs.main(), kept) == (0, [ROOT / 'build' / 'bench' / 'results.json'])
+    monkeypatch.setattr(rigs, 'keep', lambda _, path: written.append(path))
+    assert (rigs.main(), written) == (0, [ROOT / 'build' / 'bench' / 'results.json'])
 
 
 def test_the_page_is_made_of_the_results() -> None:

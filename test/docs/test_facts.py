@@ -103,6 +103,13 @@ def test_the_quoted_tables_are_the_printed_ones(
 
 
 @pytest.mark.slow
+def test_the_quoted_answer_is_the_printed_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['discover', str(ROOT / 'docs' / 'hung.csv'), '--out', str(tmp_path)]) == 0
+    answer, *_ = capsys.readouterr().out.splitlines()
+    assert f'The answer: "{answer}"' in ' '.join((ROOT / 'docs' / 'discover.md').read_text(encoding='utf-8').split())
+
+
+@pytest.mark.slow
 def test_the_errata_of_appendix_b_are_the_printed_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['design']) == 0
     errata = capsys.readouterr().out.partition('Errata:\n')[2].rstrip()

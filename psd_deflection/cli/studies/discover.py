@@ -43,6 +43,7 @@ import dataclasses
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -410,12 +411,33 @@ def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str
         if answer.outcome is None and answer.open is not None and answer.open.useful:
             hints += how_to_record(answer.open, out)
     elif discovery.unsettled:
-        hints.append('next: psd-deflection discover with these recordings and --next plans the recording that tells')
+        hints.append(f'next: {_planning(args)} plans the recording that tells {_distinguished(discovery)}')
     if discovery.effects and discovery.verdict == 'effects_found' and not (discovery.unsettled and not args.next):
         hints.append(
             f'next: psd-deflection estimator --params-file {out / "model.yaml"} corrects readings for what it can'
         )
     return hints
+
+
+def _planning(args: argparse.Namespace) -> str:
+    """The same command with --next."""
+    words = ['psd-deflection', 'discover', *args.recordings]
+    options = [('--params-file', args.params_file), ('--namespace', args.namespace), ('--seed', args.seed or None)]
+    options += [*(('--without', name) for name in args.without), *zip(('--from', '--to'), args.span, strict=True)]
+    for option, value in options:
+        if value is not None:
+            text = value.isoformat() if isinstance(value, datetime) else str(value)
+            # A time before the first sample would be taken for an option.
+            words += [f'{option}={text}'] if text.startswith('-') else [option, text]
+    return shlex.join([*words, '--out', str(args.out), '--next'])
+
+
+def _distinguished(discovery: Discovery) -> str:
+    """Each cause that is named from what explains the recordings as well."""
+    named = [(e.name, e.equivalent) for e in discovery.effects] + [(f.name, f.equivalent) for f in discovery.setup]
+    open_causes = [(name, [c for c in causes if c in discovery.unsettled]) for name, causes in named]
+    apart = [f'{name} from {", ".join(causes)}' for name, causes in open_causes if causes]
+    return ' and '.join(apart) or f'{", ".join(discovery.unsettled)} apart'
 
 
 def answer_of(path: str, asked: DiscoverOptions) -> Any:

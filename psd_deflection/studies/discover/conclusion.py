@@ -26,7 +26,7 @@ from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
-from psd_deflection.studies.discover.hidden import RIG_NUMBERS
+from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP
 from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.redundant import STAGES
 from psd_deflection.studies.discover.search.comparison import Comparison
@@ -296,7 +296,7 @@ class RigConclusion(Conclusion):
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
         first, *remaining_lines = super().lines()
-        out = [first, *self.late, *(f'set-up: {f"{f.name} {_place(f)}".strip()}: {f.fix}' for f in self.setup)]
+        out = [first, *self.late, *map(_setup_line, self.setup)]
         numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
         out += [f'rig file: {line(key, self.values[key])}' for key in numbers]
         for e in self.effects:
@@ -403,15 +403,40 @@ def _residual_words(discovery: Conclusion) -> str:
 
 
 def _setup(discovery: RigConclusion) -> str:
-    """What is wrong with the set-up, in a sentence, or nothing."""
+    """What is wrong with the set-up, in a sentence, or nothing; with what else the same recording may be of."""
     where: dict[str, dict[str, None]] = {}
+    alternatives: dict[str, dict[str, None]] = {}
     for f in discovery.setup:
         if f.name in ('load_time', 'load_delay') and isinstance(f.value, float) and abs(f.value) < BY_HAND_S:
             continue
+        name = f.name.replace('_', ' ')
         place = ', '.join(filter(None, (_place(f), _seconds(f))))
-        where.setdefault(f.name.replace('_', ' '), {}).update({place: None} if place else {})
-    names = [f'{name} ({"; ".join(places)})' if places else name for name, places in where.items()]
-    return f'The set-up is not as the rig file or the recording says: {", ".join(names)}.' if names else ''
+        where.setdefault(name, {}).update({place: None} if place else {})
+        alternatives.setdefault(name, {}).update(dict.fromkeys(other_causes(f)))
+    names = []
+    for name, places in where.items():
+        causes = [or_else(alternatives[name])] if alternatives[name] else []
+        details = '; '.join([*places, *causes])
+        names.append(f'{name} ({details})' if details else name)
+    may_be_effect = any(other in effect_names() for causes in alternatives.values() for other in causes)
+    or_effect = ', or one effect is missing' if may_be_effect else ''
+    return f'The set-up is not as the rig file or the recording says{or_effect}: {", ".join(names)}.' if names else ''
+
+
+def or_else(causes: Iterable[str]) -> str:
+    """What explains the recordings as well as what is named, in words."""
+    return f'or {", ".join(causes)}: this data cannot tell'
+
+
+def other_causes(finding: Finding) -> list[str]:
+    """Mistakes and effects, by name, that explain the recordings as well; another wiring needs more changes."""
+    return [name for name in finding.equivalent if name in SETUP or name in effect_names()]
+
+
+def _setup_line(finding: Finding) -> str:
+    """A mistake of the set-up, what else it may be, and what puts it right, in a line."""
+    besides = f'({or_else(causes)})' if (causes := other_causes(finding)) else ''
+    return f'set-up: {" ".join(filter(None, (finding.name, _place(finding), besides)))}: {finding.fix}'
 
 
 def _place(finding: Finding) -> str:
@@ -499,7 +524,7 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     for e in discovery.effects:
         text = e.active.label
         if e.equivalent:
-            text += f' (or {", ".join(e.equivalent)}: this data cannot tell)'
+            text += f' ({or_else(e.equivalent)})'
         parts.append(text)
     sizes = '; '.join(f'{e.active.effect.name} {size}' for e in discovery.effects if (size := size_of(e)))
     fitted = f' Fitted: {sizes}.' if sizes else ''

@@ -17,7 +17,7 @@ from psd_deflection.model.simulation.declaration import EffectParameter
 from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import FloatArray, channel_names
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
+from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion, other_causes
 from psd_deflection.studies.discover.law_features import known_values
 from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.search.comparison import BANDS, Comparison
@@ -277,8 +277,10 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     of_rig = discovery if isinstance(discovery, RigConclusion) else None
     out = [PageSection('', (_waterfall(discovery),))]
     if of_rig is not None and of_rig.setup:
-        wrong = [(f.name, f.where, _value(f), f.fix) for f in of_rig.setup]
-        out.append(PageSection('Set-up', (table(('mistake', 'where', 'value', 'what puts it right'), wrong),)))
+        wrong = [(f.name, f.where, _value(f), f.fix, ', '.join(other_causes(f))) for f in of_rig.setup]
+        head = ('mistake', 'where', 'value', 'what puts it right', 'explains it as well')
+        most = len(head) if any(row[-1] for row in wrong) else -1
+        out.append(PageSection('Set-up', (table(head[:most], [row[:most] for row in wrong]),)))
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))
     law = [] if of_rig is None or of_rig.law is None else _law_section(of_rig, of_rig.law)

@@ -351,14 +351,8 @@ def test_the_best_of_each_variant_is_tried() -> None:
     def score(name: str, gain: float, dof: int = 1) -> Any:
         return SimpleNamespace(gain=gain, dof=dof, candidate=SimpleNamespace(variant=(name,)))
 
-    scores = [
-        score('a', 100.0),
-        score('a', 90.0),
-        score('b', 60.0, 9),
-        score('c', 55.0),
-        score('d', 29.0),
-        score('e', 31.0),
-    ]
+    gains = (100.0, 90.0, 60.0, 55.0, 29.0, 31.0)
+    scores = [score(name, gain, 9 if name == 'b' else 1) for name, gain in zip('aabcde', gains, strict=True)]
     assert [s.candidate.variant[0] for s in promising(scores, 3.0, 0.3, 9)] == ['a', 'c', 'b', 'e']
     assert len(promising(scores, 3.0, 0.3, 2)) == 2
     assert promising([score('a', 0.0)], 3.0, 0.0, 9) == []
@@ -373,11 +367,8 @@ def test_a_plan_says_what_it_separates() -> None:
     piece, other = Piece('push', ('constant:0,-5,0:3',)), Piece('wait', ('constant:0,0,0:1', 'constant:0,0,0:2'))
     limits = Limits(seconds=30.0)
     warm = Setting('while it is warm', {'link.length': 0.4}, 5.0)
-    reports = (
-        reported_of('damping', 30.0, 40.0, 50.0),
-        reported_of('tip_mass', 90.0, 22.0, 99.0),
-        reported_of('x', 1.0, 2.0, 21.5),
-    )
+    rows = ('damping', 30.0, 40.0, 50.0), ('tip_mass', 90.0, 22.0, 99.0), ('x', 1.0, 2.0, 21.5)
+    reports = tuple(reported_of(*row) for row in rows)
     plan = Plan(warm, (piece, piece, other), reports, limits, 500.0)
     assert plan.words == 'push, 2 times; then wait, while it is warm'
     assert plan.seconds == 9.0
@@ -401,14 +392,8 @@ def test_a_plan_says_what_it_separates() -> None:
     assert tree['celsius'] == warm.knots
     assert idle.tree()['celsius'] is None
     assert (tree['seconds'], tree['sample_rate_hz'], tree['overrides']) == (9.0, 500.0, {'link.length': 0.4})
-    assert tree['rivals'][1] == {
-        'name': 'tip_mass',
-        'instead_of': 'creep',
-        'separation': 90.0,
-        'reverse': 22.0,
-        'possible': 99.0,
-        'separable': True,
-    }
+    names = ('name', 'instead_of', 'separation', 'reverse', 'possible', 'separable')
+    assert tree['rivals'][1] == dict(zip(names, ('tip_mass', 'creep', 90.0, 22.0, 99.0, True), strict=True))
     assert (tree['useful'], tree['loads'], tree['limits']['seconds']) == (True, plan.script, 30.0)
     assert [reported_of('x', 0.0, 0.0, p).separable for p in (21.5, 21.6)] == [False, True]
     assert Suggestion('do', 21.7).text == 'do: in simulation this separates them by 4.7 standard deviations'
@@ -473,14 +458,8 @@ def test_what_remains_is_reported_in_words() -> None:
         )
         assert ('hysteretic' in unknown_of(left_with(dependences=depends), 0.0)[0].signature) == lagging
     # Twice as much of one kind is most of it.
-    for even, word in (
-        (20.1, 'mostly even'),
-        (20.0, 'odd and even parts'),
-        (5.0, 'odd and even parts'),
-        (19.9, 'odd and even parts'),
-        (5.1, 'odd and even parts'),
-        (4.9, 'mostly odd'),
-    ):
+    both = dict.fromkeys((20.0, 19.9, 5.1, 5.0), 'odd and even parts')
+    for even, word in {20.1: 'mostly even', **both, 4.9: 'mostly odd'}.items():
         depends = (Dependence('x2', 'dot_x^2', even, 1e-9), Dependence('x2', 'dot_x', 10.0, 1e-9))
         assert word in unknown_of(left_with(dependences=depends), 0.0)[0].signature
     # What coarse steps do varies with the signal: a fiftieth of what they explain is nothing else.
@@ -499,15 +478,8 @@ def test_a_gap_that_remains_is_never_left_unreported() -> None:
 
 
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
-    full = {
-        'sd': {},
-        'p': 1e-9,
-        'delta_bic': 50.0,
-        'heldout': HeldOut(20.0, 2.0),
-        'equivalent': (),
-        'fitted_alternatives': (),
-    }
-    return NamedEffect(active, **{**full, 'alternatives': (), 'suggestion': None, **given})
+    full = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': ()}
+    return NamedEffect(active, **{**full, 'fitted_alternatives': (), 'alternatives': (), 'suggestion': None, **given})
 
 
 def test_numbers_of_json_are_finite() -> None:
@@ -753,7 +725,8 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
         f' close the gap from {before} to {after}, but their sizes are tied: '
         'one effect that is not in the catalogue is likelier.'
     )
-    setup = (Finding('channel_sign', 'y1', -1.0, 'x'), Finding('channel_sign', 'y1', -1.0, 'y'))
+    mirrored = Finding('channel_sign', 'y1', -1.0, 'y', 9.0, ('load_sign of fy',))
+    setup = (Finding('channel_sign', 'y1', -1.0, 'x'), mirrored)
     assert sentence(verdict='nothing_missing', effects=(), setup=setup) == (
         'The set-up is not as the rig file or the recording says: channel sign (y1). '
         f'Nothing is missing besides: the gap is {after}.'
@@ -768,6 +741,14 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
         'sensor_rotation (psd 2) is missing from the model besides; adding it and putting the set-up right together '
         f'close the gap from {before} to {after}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
+    length = Finding('link_length', 'link.length', 1.02, 'link.length: 0.5967', 0.0, ('creep', 'sensitivity'))
+    alike = dataclasses.replace(study, setup=(length,))
+    assert 'recording says, or one effect is missing: link length (link.length; or creep, sens' in alike.sentence
+    causes = '(or creep, sensitivity: this data cannot tell)'
+    assert alike.lines()[1] == f'set-up: link_length link.length {causes}: link.length: 0.5967'
+    assert '<td>creep, sensitivity</td>' in alike.files()['report.html']
+    mistakes = dataclasses.replace(study, setup=(dataclasses.replace(length, equivalent=('sensitivity',)),)).sentence
+    assert 'says: link length (link.length; or sensitivity: this data cannot tell). sensor_rotation' in mistakes
     unannotated = Finding('load_coverage', late.where, 0.5, 'note it')
     partly = {'verdict': 'unknown_effect', 'unknown': (Unknown('', (), 0.5),)}
     described = sentence(setup=(unannotated,), **partly)
@@ -779,13 +760,7 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
     alternative = Alternative(named.active, {'angle': 1e-3}, 4.0, study.fit)
-    listed_alternatives = dataclasses.replace(
-        study, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),)
-    ).tree()
-    assert listed_alternatives['effects'][0]['rivals'] == [
-        {
-            'name': 'sensor_rotation',
-            'parameters': {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}},
-            'delta_bic': 4.0,
-        }
-    ]
+    more = dataclasses.replace(study, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),))
+    parameters = {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}}
+    alternative = {'name': 'sensor_rotation', 'parameters': parameters, 'delta_bic': 4.0}
+    assert more.tree()['effects'][0]['rivals'] == [alternative]

@@ -212,6 +212,10 @@ def test_the_command_settles_what_one_length_leaves_open(
 ) -> None:
     limits = ['--limit', 'swing=0', '--limit', 'sweep=0', '--limit', 'seconds=12', '--quiet']
     truth = ['--effect', 'clamp_bending_compliance,compliance=2e-7']
+    command = ['discover', str(soft), '--without', 'creep', '--from', '0.0', '--out', str(tmp_path)]
+    assert main([*command, '--quiet']) == 0
+    planning = f'next: {shlex.join(["psd-deflection", *command, "--next"])} plans the recording that tells '
+    assert f'{planning}link_length from clamp_bending_compliance, ' in capsys.readouterr().out
     assert main(['discover', str(soft), '--out', str(tmp_path), '--next', '--run', *truth, *limits]) == 0
     assert 'The answer is unique after 1 more recording.' in capsys.readouterr().out
     tree = json.loads((tmp_path / 'result.json').read_text())
@@ -224,22 +228,12 @@ def test_the_command_settles_what_one_length_leaves_open(
     assert (observed.name, observed.rig.link.length) == (made['file'], 0.409)
 
 
-class Nothing:
-    """Stands for an answer that writes nothing."""
-
-    def files(self) -> dict[str, str]:
-        return {}
-
-    def tree(self) -> dict[str, object]:
-        return {}
-
-
 @pytest.mark.slow
 def test_a_plan_is_written_as_files_that_the_commands_take(
     plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     warm = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, swing=2.0))
-    files = loop.LoopResult(cast(Discovery, Nothing()), (), warm, None).files()
+    files = loop.LoopResult(cast(Discovery, SimpleNamespace(files=dict, tree=dict)), (), warm, None).files()
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     lines = how_to_record(warm, tmp_path)

@@ -46,13 +46,17 @@ NOISE = 1e-6
 
 
 def read(
-    effects: Sequence[ActiveEffect], kind: str = 'dots', length: float = RIG.link.length, seed: int = 0
+    effects: Sequence[ActiveEffect],
+    kind: str = 'dots',
+    length: float = RIG.link.length,
+    seed: int = 0,
+    loads: FloatArray = LOADS,
 ) -> Readings:
     """What a rig with ``effects`` shows."""
     rig = replace_values(RIG, {'link.length': length})
-    table = Readings('table', rig, kind, LOADS, np.zeros((len(LOADS), len(CHANNELS[kind]))))
+    table = Readings('table', rig, kind, loads, np.zeros((len(loads), len(CHANNELS[kind]))))
     values = 1e-6 * ReadingsPlant([table]).simulate_effects(effects)[0].T
-    return Readings(table.name, rig, kind, LOADS, values + np.random.default_rng(seed).normal(0.0, NOISE, values.shape))
+    return Readings(table.name, rig, kind, loads, values + np.random.default_rng(seed).normal(0.0, NOISE, values.shape))
 
 
 def written(path: Path, readings: FloatArray, header: str = 'x1_mm,y1_mm,x2_mm,y2_mm') -> Path:
@@ -80,6 +84,15 @@ def test_table_names_missing_effect_for_model_yaml(tmp_path: Path, capsys: pytes
     assert tree['gap']['heldout_after'] < 1.5 * 1e6 * NOISE < 10.0 < tree['gap']['before']
     repaired = load_rig(tmp_path / 'found' / 'model.yaml')
     assert discover_in(ReadingsPlant(read_tables([table], repaired))).verdict == 'nothing_missing'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('rows', 'y', 'seed'), [(8, 0.02, 9), (8, 0.02, 10), (10, -0.0125, 0), (10, -0.0125, 4)])
+def test_of_a_short_table_one_effect_is_named_and_nothing_more(rows: int, y: float, seed: int) -> None:
+    loads = LOADS[[0, 1, 2, 3, *([4, 5] if rows == 10 else []), 6, 7, 8, 11]]
+    gain = make_active('sensor_gain', {'psd': 2, 'y': y}, 'test')
+    discovery = discover_in(ReadingsPlant([read([gain], seed=seed, loads=loads)]))
+    assert (discovery.verdict, [e.name for e in discovery.effects]) == ('effects_found', ['sensor_gain'])
 
 
 @pytest.mark.slow

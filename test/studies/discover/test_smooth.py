@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 from scipy.linalg import null_space
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, ttest_1samp
 
 import psd_deflection
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
@@ -254,6 +254,13 @@ def test_what_small_terms_do_together_is_reported_everywhere() -> None:
     assert message['unseen'] < message['unseen_named']
     assert f'{len(message["terms"])} small terms together lower the unseen error' in discovery.sentence
     assert 'small terms together' in discovery.files()['report.html']
+
+
+def test_one_case_that_gains_much_proves_nothing() -> None:
+    for gained in np.array([[38.65, 1.29, -1.87, 0.1, -0.18, -1.54], [3.0, 2.5, 1.0, 2.0, 4.0, 2.2]]):
+        want = ttest_1samp(gained, 0.0, alternative='greater').pvalue
+        assert predictive.by_chance(gained) == pytest.approx(want)
+        assert (want > predictive.CHANCE) == (gained[0] > 38.0)
 
 
 class Zeros(Plant):

@@ -4,12 +4,13 @@
 1993; tempered Gibbs sampler, Zanella and Roberts 2019) and the mean taken. The error on unseen cases is nested: terms
 and sizes are chosen anew without the cases that judge them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import stdtr
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
@@ -31,6 +32,9 @@ ELSEWHERE = 0.1
 ROUNDS = 4
 LOWERS = 0.05
 """Share by which the unseen error must fall at least before anything is said to remain."""
+CHANCE = 0.01
+"""One-sided p of Student's paired t over the unseen cases, up to which the fall is beyond chance: one that the named
+effects predict badly proves nothing."""
 NEGLIGIBLE = 0.003
 """A term that moves less than this share of what remains is left out of the list and of the model."""
 MOST_VALUES = 4e7
@@ -55,7 +59,7 @@ class PredictingTerm:
 class Predictive:
     """``effects``: the model that predicts best, nuisance first. ``terms``: beyond the named effects, the largest
     first. ``unseen``: the gap on cases for which terms and sizes were chosen without them; ``unseen_named``: that of
-    the named effects, refitted without them. ``unexplained``: whether the difference is beyond chance.
+    the named effects, fitted or averaged without them. ``unexplained``: whether the difference is beyond chance.
     """
 
     effects: tuple[ActiveEffect, ...]
@@ -330,6 +334,14 @@ class _Line:
         out[self.named] = _solved(t[:-1, :-1][np.ix_(self.named, self.named)], t[:-1, -1][self.named])
         return out
 
+    def shrunk(self, moments: _Moments, rng: np.random.Generator) -> FloatArray:
+        """Sizes (p,) of the named model alone, averaged as those of all terms are."""
+        at = np.append(np.flatnonzero(self.named), len(self.named))
+        only = _Moments(moments.table[np.ix_(at, at)], moments.always, moments.size)
+        out = np.zeros(len(self.named))
+        out[self.named] = self.solved(only, rng)[0]
+        return out
+
 
 def _line(library: _Library, x: FloatArray, named: BoolArray) -> _Line:
     ws = library.ws
@@ -369,13 +381,20 @@ def predictive_of(ws: Comparison, fit: Fit, screen: Screen, rng: np.random.Gener
         line = _line(library, x, named)
     unseen, before, gained = _unseen(line, x, rng)
     better = unseen < before
-    # By chance the averaged model hardly ever gains: where nothing stands out, it is next to nothing.
-    clear = float(gained.sum()) > float(np.sqrt(len(gained)) * np.std(gained))
+    # By its own account the averaged model has so many terms more, and no more than the values can tell.
+    further = float(weights[~named].sum())
+    clear = by_chance(gained) <= CHANCE and 1.0 <= further < line.size - named.sum()
     noise = before <= (1.0 + LOWERS) * ws.floor()
     remains = clear and not noise and unseen < (1.0 - LOWERS) * before
     terms = _terms(line, x, weights) if better else ()
     chosen = x if better else start
     return Predictive(tuple(library.at(chosen)), terms, unseen, before, remains and bool(terms))
+
+
+def by_chance(gained: FloatArray) -> float:
+    """Return how likely cases (n,) that gain nothing on average gain ``gained`` or more, by Student's paired t."""
+    error = float(np.std(gained, ddof=1) * np.sqrt(len(gained)))
+    return float(stdtr(len(gained) - 1, -float(gained.sum()) / max(error, 1e-300)))
 
 
 def _reached(line: _Line, x: FloatArray, sizes: FloatArray) -> tuple[FloatArray, bool]:
@@ -412,12 +431,19 @@ def _as_line(line: _Line, residual: FloatArray) -> FloatArray:
 def _unseen(line: _Line, x: FloatArray, rng: np.random.Generator) -> tuple[float, float, FloatArray]:
     """Gap on unseen cases of the averaged and of the named model, and the drop of squared error on each case."""
     library, ws = line.library, line.library.ws
-    more, named = np.empty_like(line.target), np.empty_like(line.target)
-    for fold in range(len(line.tables)):
-        test = line.fold == fold
-        moments = line.moments(fold)
-        for out, sizes in ((more, line.solved(moments, rng)[0]), (named, line.refitted(moments))):
-            out[test] = line.target[test] - line.columns[test] @ sizes
+    moments = [line.moments(fold) for fold in range(len(line.tables))]
+
+    def error(sizes: Callable[[_Moments], FloatArray]) -> FloatArray:
+        out = np.empty_like(line.target)
+        for fold, of_others in enumerate(moments):
+            test = line.fold == fold
+            out[test] = line.target[test] - line.columns[test] @ sizes(of_others)
+        return out
+
+    more = error(lambda of_others: line.solved(of_others, rng)[0])
+    named_errors = error(line.refitted), error(lambda of_others: line.shrunk(of_others, rng))
+    # A named number that the other cases hardly tell is wild on this one: that is no sign of further terms.
+    named = min(named_errors, key=lambda white: float(white @ white))
     back = 1.0 if ws.open_level else np.sqrt(max(ws.size, 1) / line.size)
     now, difference = library.residual(x)
 

@@ -337,11 +337,22 @@ class Trials:
         """Return whether one more effect would pass, to first order."""
         return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
 
+    def _may_stand_out(self, current: Fit, score: Score) -> bool:
+        """Return whether an effect passes at the level that it leaves, to first order: at the level before, chi-square
+        falls by no more than the number of values, which is little of a short table.
+        """
+        if not self.workspace.open_level:
+            return False
+        moved = np.stack(self.screen.columns_of(score.candidate), axis=1) @ score.coefficients
+        gain = current.chi2 - self.workspace.loss(current.residual - moved)
+        return self.library_p(gain, score.dof) <= self.workspace.p_accept
+
     def further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
         """``current`` with the best further effect."""
-        if not scores or min(s.p for s in scores) > self.workspace.p_accept:
-            return None
         # From the second effect on, the residual is smaller and the first guess better.
         tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
+        least = min((s.p for s in scores), default=1.0)
+        if least > self.workspace.p_accept and not any(self._may_stand_out(current, s) for s in tried):
+            return None
         starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
         return self.best_of(starts, 2, 6) if current.effects else self.best_of(starts, 4, 12)
