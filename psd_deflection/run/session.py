@@ -228,7 +228,7 @@ class Session:
 
         if wanted:
             hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
-            asked = self.recorder.start(self.rig, hello, self.pipeline.memory)
+            asked = self.recorder.start(self.rig, hello, self.pipeline.snapshot)
         else:
             asked = self.processing.request(self.recorder.stop)
         asked.add_done_callback(notify)
