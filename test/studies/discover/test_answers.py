@@ -759,8 +759,8 @@ def test_other_answers_have_other_sentences(study: Discovery) -> None:
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
-    neighbour = Alternative(named.active, {'angle': 1e-3}, 4.0, study.fit)
-    more = dataclasses.replace(study, effects=(dataclasses.replace(named, fitted_alternatives=(neighbour,)),))
+    alternative = Alternative(named.active, {'angle': 1e-3}, 4.0, study.fit)
+    more = dataclasses.replace(study, effects=(dataclasses.replace(named, fitted_alternatives=(alternative,)),))
     parameters = {'psd': 2, 'angle': {'value': named.active.values['angle'], 'sd': 1e-3, 'unit': 'rad'}}
-    neighbour = {'name': 'sensor_rotation', 'parameters': parameters, 'delta_bic': 4.0}
-    assert more.tree()['effects'][0]['rivals'] == [neighbour]
+    listed = {'name': 'sensor_rotation', 'parameters': parameters, 'delta_bic': 4.0}
+    assert more.tree()['effects'][0]['rivals'] == [listed]
