@@ -14,7 +14,7 @@ from psd_deflection.measure.estimation import HELD, ZERO_VARIANCES
 from psd_deflection.measure.health import FROZEN, LOUD
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.state import load_states
-from psd_deflection.measure.uncertainty.block_estimator import DRIFT, HUM, NOISE, PSDS, STEPS, VIBRATION
+from psd_deflection.measure.uncertainty.block_estimator import DRIFT, HUM, MOVES, NOISE, PSDS, STEPS, VIBRATION
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.model.simulation.tip_load import TIP_LOADS
 from psd_deflection.recordings.read.readers import open_recording
@@ -168,6 +168,7 @@ CASES = {
     'vibrates': Case(VIBRATION, (99, 171), vibrating),
     'hums': Case(HUM, (99, 171), humming),
     'drifts': Case(DRIFT, (130, 271), drifting),
+    'moves': Case(MOVES, (151,)),
     'ten bits': Case(STEPS, (160,), coarse),
     'PSD 2 dark': Case(HELD, (212, 260), dark, {'degraded': 'hold'}),
     'PSD 1 stands still': Case(FROZEN, (178,), stuck, {'frozen': 'reject'}),

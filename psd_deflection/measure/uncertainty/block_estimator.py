@@ -154,10 +154,11 @@ def _common(a: float, b: float, within: float) -> float:
 
 
 NOISE, SEGMENT, SUMS = 'state.noise', 'state.noise_segment', 'state.sums_segment'
-VIBRATION, HUM, DRIFT, STEPS, PSDS = (
+VIBRATION, HUM, DRIFT, MOVES, STEPS, PSDS = (
     'state.vibration',
     'state.hum',
     'state.drift',
+    'state.moves',
     'state.converter_steps',
     'state.psds.',
 )
@@ -174,7 +175,7 @@ class BlockEstimator:
     """
 
     part = 'the fit and the noise of the dots'
-    prefixes = (NOISE, SUMS, VIBRATION, HUM, DRIFT, STEPS, PSDS)
+    prefixes = (NOISE, SUMS, VIBRATION, HUM, DRIFT, MOVES, STEPS, PSDS)
 
     def __init__(self, rig: Rig, on_plate: bool = True, tilts: Tilts = 'none') -> None:
         """``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs."""
@@ -199,7 +200,7 @@ class BlockEstimator:
         self.chi_square = 0.0
         self.poor_fits = 0
         self.vibrating: tuple[Tone, ...] = ()
-        self._fitted: FittedBlock | None = None
+        self._disturbed = self._moves = self._poor_fit = False
         self._use_noise()
 
     def _model(self) -> tuple[FloatArray | None, Residual | None]:
@@ -229,9 +230,11 @@ class BlockEstimator:
 
     def record(self, fitted: FittedBlock | None, excluded: tuple[int, ...]) -> None:
         """Take what the last block was solved from: its fit, None without one, and the PSDs (from 1) not used."""
-        self.excluded, self.vibrating, self._fitted = excluded, (), fitted
+        self.excluded, self.vibrating, self._disturbed = excluded, (), fitted is not None
         if fitted is not None:
             self.poor_fits += fitted.poor_fit
+            # A block of many samples hides the end of a motion that the one before it showed.
+            self._moves, self._poor_fit = fitted.poor_fit or self._poor_fit, fitted.poor_fit
             self.vibrating = tuple(self.noise.tones[i] for i in fitted.vibrating)
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
@@ -286,11 +289,11 @@ class BlockEstimator:
     @property
     def findings(self) -> tuple[str, ...]:
         """Return what disturbs the last block: vibration, hum, drift, motion that its polynomials cannot follow."""
-        if self._fitted is None:
+        if not self._disturbed:
             return ()
         vibrates = f'vibrates: {self.vibrates}' if self.vibrating else ''
         hum = words_of(self.noise.hum, self._rig.converter.sample_rate_hz)
-        moves = f'moves: faster than {self._size} samples show' if self._fitted.poor_fit else ''
+        moves = f'moves: faster than {self._size} samples show' if self._moves and self.noise.measured else ''
         return tuple(filter(None, (vibrates, f'hum: {hum}' if hum else '', self._drift_words(), moves)))
 
     def _drift_words(self) -> str:
@@ -355,12 +358,16 @@ class BlockEstimator:
 
     def state_dict(self) -> State:
         """See :class:`psd_deflection.measure.state.Part`."""
-        out: State = {}
+        out: State = {MOVES: (1.0,)} if self._poor_fit else {}
         if self.on_plate:
             tones = tuple(v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist()))
             hum = tuple(v for h in self.noise.hum for v in (h.frequency, *h.cosine.tolist(), *h.sine.tolist()))
             rows = {NOISE: self.noise.state(), VIBRATION: tones, HUM: hum, SEGMENT: self.noise.segment()}
-            rows |= {SUMS: self.noise.sums(), DRIFT: self.noise.drift.state(), STEPS: self._converter.state()}
+            rows |= {
+                SUMS: self.noise.sums(),
+                DRIFT: self.noise.drift.state(),
+                STEPS: self._converter.state(),
+            }
             out |= {name: row for name, row in rows.items() if row}
         sets = {self.full.psds: self.full, **self._subsets}
         states = {**self._pending, **{psds: psd_set.state() for psds, psd_set in sets.items()}}
@@ -371,6 +378,7 @@ class BlockEstimator:
         if steps := numbers(values, STEPS, 'the steps of these channels'):
             self._converter.set_state(steps)
             self._use_steps()
+        self._poor_fit = MOVES in values
         if noise := numbers(values, NOISE, 'the noise of this rig'):
             self.noise.hum = _hum(numbers(values, HUM, 'the hum') or (), 2 * len(self._rig.psds))
             self.noise.set_state(noise)
