@@ -70,8 +70,8 @@ def of_setting(setting: Setting, *words: str) -> str:
 def record(folder: Path) -> None:
     """The golden recordings' samples through the pipeline of this process, recorded in ``folder``."""
     from psd_deflection.measure.pipeline import Pipeline
+    from psd_deflection.recordings.formats.format import open_sink
     from psd_deflection.recordings.replay.engine import open_for_replay, replayed
-    from psd_deflection.recordings.write.sinks import open_sink
 
     for name in NAMES:
         recording, rig = open_for_replay(str(BAGS / name), None, None)

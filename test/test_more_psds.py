@@ -16,8 +16,8 @@ from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.formats.format import open_sink
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import (
     MOST_PSDS,
     BlockStatus,

@@ -149,7 +149,7 @@ def csv_target() -> tuple[Target, list[bytes]]:
 def parameters_target() -> tuple[Target, list[bytes]]:
     """A parameter file, and the rig of it; the kept zero as well."""
     from psd_deflection.rig.config import load_rig
-    from psd_deflection.run.zero_store import ZeroStore
+    from psd_deflection.run.state import ZeroStore
 
     nominal = load_rig()
 

@@ -61,11 +61,11 @@ from psd_deflection.cli._values import given_as_option, integer, seed
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names, with_effects
 from psd_deflection.model.simulation.loads import load_history
+from psd_deflection.recordings.formats.format import open_sink
 from psd_deflection.recordings.observation import Observation, read_observation
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRun
 from psd_deflection.recordings.spans import FULL
 from psd_deflection.recordings.write.parquet import ERROR, Field
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.conclusion import adopting_folder

@@ -10,8 +10,8 @@ import numpy as np
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate.layout import Geometry, check_twist
 from psd_deflection.model.plate.plate import flat_points, plate_points
-from psd_deflection.model.solvers.fixed_gain import FixedGain
 from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.ols import FixedGain
 from psd_deflection.model.solvers.wls import THESIS_ROW_SCALING
 from psd_deflection.records import FloatArray
 

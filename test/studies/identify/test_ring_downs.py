@@ -16,7 +16,7 @@ from blind.modes import CASES, RATE, Link, driven, rung, scored
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import from_recordings
 from psd_deflection.studies.identify import modes as fitting
-from psd_deflection.studies.identify.from_recordings import read_identify
+from psd_deflection.studies.identify.identify import read_identify
 
 SAMPLE_RATE = 1024.0
 """A power of two: times of samples have no error."""
