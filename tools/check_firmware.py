@@ -17,7 +17,7 @@ from psd_deflection.run.session import Session
 from tools.program import Program
 
 COMMAND = [
-    *('qemu-system-arm', '-machine', 'mps2-an385', '-display', 'none', '-monitor', 'none', '-chardev', 'pty,id=uart'),
+    *('qemu-system-arm', '-machine', 'mps2-an385', '-display', 'none', '-monitor', 'none', '-chardev', 'pty,id=uart')
 ]
 PATIENCE_S = 60.0
 

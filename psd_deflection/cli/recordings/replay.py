@@ -357,13 +357,7 @@ def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
         summary = done.summary()
         compared = summary.pop('compared')
         print_json(
-            {
-                'recording': str(path),
-                **summary,
-                'replay_seconds': done.seconds,
-                'out': args.out,
-                'compared': compared,
-            }
+            {'recording': str(path), **summary, 'replay_seconds': done.seconds, 'out': args.out, 'compared': compared}
         )
         return
     show(

@@ -144,11 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--temperature', metavar='T0[,T1...]', help='°C, straight lines through these, evenly spread over the recording'
     )
     group.add_argument(
-        '--effect',
-        metavar='NAME,KEY=VALUE,...',
-        action='append',
-        default=[],
-        help='add a hidden effect; repeatable',
+        '--effect', metavar='NAME,KEY=VALUE,...', action='append', default=[], help='add a hidden effect; repeatable'
     )
     group.add_argument(
         '--true-pose',

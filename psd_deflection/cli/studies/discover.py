@@ -239,11 +239,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--seed', type=seed, default=0, help='seed of the bootstraps; the same gives the same answer (default 0)'
     )
     parser.add_argument(
-        '--without',
-        metavar='EFFECT',
-        action='append',
-        default=[],
-        help='do not consider this effect; repeatable',
+        '--without', metavar='EFFECT', action='append', default=[], help='do not consider this effect; repeatable'
     )
     parser.add_argument(
         '--isolable', metavar='LOADS', help='without REC: which effects a recording under these loads could tell apart'

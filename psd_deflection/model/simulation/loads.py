@@ -76,11 +76,7 @@ def ramp(
 
 
 def chirp(
-    amplitude: tuple[float, float, float],
-    f0: float,
-    f1: float,
-    duration: float,
-    rate: float = 1000.0,
+    amplitude: tuple[float, float, float], f0: float, f1: float, duration: float, rate: float = 1000.0
 ) -> LoadHistory:
     """A sine whose frequency rises steadily from ``f0`` to ``f1`` Hz."""
     t = np.arange(_count(duration, rate)) / rate

@@ -158,11 +158,7 @@ def open_sink(
     if form.write is None:
         raise RecordingError(f'{path}: {form.help} is read and not written')
     options = WriteOptions(
-        rig_values=rig_values,
-        device_hello=device_hello,
-        samples_with=samples_with,
-        title=title,
-        psds=psds,
+        rig_values=rig_values, device_hello=device_hello, samples_with=samples_with, title=title, psds=psds
     )
     return form.write(Path(path), options)
 

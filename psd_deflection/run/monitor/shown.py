@@ -13,9 +13,7 @@ from typing import Any, Protocol
 from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.measure.steps import REACH_S, RecentDots
 from psd_deflection.measure.watch import Alarm
-from psd_deflection.records import (
-    DiagnosticReport,
-)
+from psd_deflection.records import DiagnosticReport
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.monitor.metrics import Family, of_session

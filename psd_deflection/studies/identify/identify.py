@@ -202,10 +202,7 @@ class Identified(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """Modes and shapers of each axis, and parameters, SI units."""
-        return {
-            'axes': {name: self._axis_tree(i) for i, name in enumerate(AXES)},
-            'parameters': self.values,
-        }
+        return {'axes': {name: self._axis_tree(i) for i, name in enumerate(AXES)}, 'parameters': self.values}
 
     def _axis_tree(self, i: int) -> dict[str, Any]:
         axis, best = self.axes[i], self.shaper_of(i)

@@ -115,9 +115,7 @@ class AppendixDResult(NamedTuple):
 
 
 def appendix_d_iterative(
-    dots_mm: tuple[float, ...],
-    init_mm: tuple[float, ...],
-    centers_mm: tuple[float, ...] = (0.0, 70.0, -100.0, 0.0),
+    dots_mm: tuple[float, ...], init_mm: tuple[float, ...], centers_mm: tuple[float, ...] = (0.0, 70.0, -100.0, 0.0)
 ) -> AppendixDResult:
     """Return the code of Appendix D: dots x1, y1, x2, y2 and their pre-load values, mm.
 
