@@ -66,27 +66,20 @@ def _signed(rng: np.random.Generator) -> tuple[float, float]:
     return math.cos(angle), math.sin(angle)
 
 
-def _xy(scale: float, names: tuple[str, str] = ('x', 'y'), psd: bool = False, **more: Any) -> Draw:
+def _draw_of(*names: str, scale: float, signed: bool = True, psd: bool = False, **more: Any) -> Draw:
+    """Of one value, with a sign by chance, or of two, with an angle by chance."""
+
     def draw(rng: np.random.Generator, size: float) -> dict[str, Any]:
-        a, b = _signed(rng)
-        out = {
-            names[0]: scale * size * a,
-            names[1]: scale * size * b,
-            **{k: int(rng.choice(v)) for k, v in more.items()},
-        }
-        return {'psd': int(rng.integers(1, 3)), **out} if psd else out
-
-    return draw
-
-
-def _draw_of(name: str, scale: float, signed: bool = True, psd: bool = False, **more: Any) -> Draw:
-    def draw(rng: np.random.Generator, size: float) -> dict[str, Any]:
-        sign = float(rng.choice((-1.0, 1.0))) if signed else 1.0
-        out: dict[str, Any] = {name: sign * scale * size}
+        signs = _signed(rng) if len(names) == 2 else [float(rng.choice((-1.0, 1.0))) if signed else 1.0]
+        out: dict[str, Any] = {name: scale * size * sign for name, sign in zip(names, signs, strict=True)}
         out.update({k: int(rng.choice(v)) for k, v in more.items()})
         return {'psd': int(rng.integers(1, 3)), **out} if psd else out
 
     return draw
+
+
+def _xy(scale: float, names: tuple[str, str] = ('x', 'y'), **more: Any) -> Draw:
+    return _draw_of(*names, scale=scale, **more)
 
 
 def _creep(rng: np.random.Generator, size: float) -> dict[str, Any]:
@@ -131,47 +124,47 @@ def _saturation(rng: np.random.Generator, size: float) -> dict[str, Any]:
 
 
 DRAWS: Mapping[str, Draw] = {
-    'bending_stiffness': _draw_of('scale', 1e-3, moves_frequency=(0, 1)),
-    'torsional_stiffness': _draw_of('scale', 1e-3, moves_frequency=(0, 1)),
-    'clamp_bending_compliance': _draw_of('compliance', 1e-7, signed=False),
-    'clamp_torsional_compliance': _draw_of('compliance', 1e-6, signed=False),
-    'clamp_friction': _draw_of('width', 1e-6, signed=False, axis=(1, 2, 3)),
+    'bending_stiffness': _draw_of('scale', scale=1e-3, moves_frequency=(0, 1)),
+    'torsional_stiffness': _draw_of('scale', scale=1e-3, moves_frequency=(0, 1)),
+    'clamp_bending_compliance': _draw_of('compliance', scale=1e-7, signed=False),
+    'clamp_torsional_compliance': _draw_of('compliance', scale=1e-6, signed=False),
+    'clamp_friction': _draw_of('width', scale=1e-6, signed=False, axis=(1, 2, 3)),
     'creep': _creep,
     'damping': _damping,
-    'tip_mass': _draw_of('mass', 1e-3, signed=False),
+    'tip_mass': _draw_of('mass', scale=1e-3, signed=False),
     'second_bending_mode': _second,
-    'self_weight': _draw_of('weight_per_length', 0.1, signed=False),
+    'self_weight': _draw_of('weight_per_length', scale=0.1, signed=False),
     'mount_tilt': _xy(1e-6),
     'load_offset': _xy(1e-4),
-    'load_direction': _draw_of('angle', 1e-3),
-    'plane_tilt': _draw_of('slope_ratio', 1.0, signed=False),
+    'load_direction': _draw_of('angle', scale=1e-3),
+    'plane_tilt': _draw_of('slope_ratio', scale=1.0, signed=False),
     'laser_pointing_drift': _xy(1e-7, ('rate_x', 'rate_y'), psd=True),
     'refraction': _xy(1e-7),
-    'sensor_rotation': _draw_of('angle', 1e-3, psd=True),
+    'sensor_rotation': _draw_of('angle', scale=1e-3, psd=True),
     'sensor_position': _xy(1e-4, psd=True, aimed=(0, 1)),
     'sensor_gain': _xy(1e-3, psd=True),
-    'sensor_nonlinearity': _draw_of('k', 100.0, psd=True),
+    'sensor_nonlinearity': _draw_of('k', scale=100.0, psd=True),
     'axis_crosstalk': _xy(1e-3, ('xy', 'yx'), psd=True),
     'ambient_light': _ambient,
     'thermal_drift': _xy(1e-7, psd=True),
-    'spot_clipping': _draw_of('radius', 1e-3, signed=False, psd=True, profile=(1, 2)),
+    'spot_clipping': _draw_of('radius', scale=1e-3, signed=False, psd=True, profile=(1, 2)),
     'mains_interference': _mains,
     'amplifier_saturation': _saturation,
-    'amplifier_lag': _draw_of('time_constant', 1e-4, signed=False),
-    'channel_skew': _draw_of('delay', 1e-4, signed=False, psd=True),
-    'quantisation': _draw_of('step', 1e-3, signed=False),
+    'amplifier_lag': _draw_of('time_constant', scale=1e-4, signed=False),
+    'channel_skew': _draw_of('delay', scale=1e-4, signed=False, psd=True),
+    'quantisation': _draw_of('step', scale=1e-3, signed=False),
     'tip_force': _xy(1e-2),
-    'alien_cubic_spring': _draw_of('size', 1e-4),
-    'alien_quadratic_load': _draw_of('size', 1e-9),
-    'alien_soft_mode': _draw_of('size', 1e-4),
-    'alien_square_crosstalk': _draw_of('size', 1.0),
-    'alien_thermal_square': _draw_of('size', 1e-7),
-    'alien_gain_drift': _draw_of('size', 1e-4),
-    'alien_thermal_gain': _draw_of('size', 1e-4),
-    'alien_rectifier': _draw_of('size', 1e-3),
-    'alien_walk': _draw_of('size', 1e-8, seed=tuple(range(100))),
-    'alien_backlash': _draw_of('size', 1e-6, signed=False),
-    'alien_beat': _draw_of('size', 1e-6),
+    'alien_cubic_spring': _draw_of('size', scale=1e-4),
+    'alien_quadratic_load': _draw_of('size', scale=1e-9),
+    'alien_soft_mode': _draw_of('size', scale=1e-4),
+    'alien_square_crosstalk': _draw_of('size', scale=1.0),
+    'alien_thermal_square': _draw_of('size', scale=1e-7),
+    'alien_gain_drift': _draw_of('size', scale=1e-4),
+    'alien_thermal_gain': _draw_of('size', scale=1e-4),
+    'alien_rectifier': _draw_of('size', scale=1e-3),
+    'alien_walk': _draw_of('size', scale=1e-8, seed=tuple(range(100))),
+    'alien_backlash': _draw_of('size', scale=1e-6, signed=False),
+    'alien_beat': _draw_of('size', scale=1e-6),
 }
 EFFECTS = tuple(n for n in DRAWS if not n.startswith('alien_'))
 ALIENS = tuple(n for n in DRAWS if n.startswith('alien_'))

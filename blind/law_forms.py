@@ -3,7 +3,7 @@
 """Laws that no catalogue has, drawn by chance over stage, variable and form; formulas of their own."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -59,7 +59,7 @@ def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
         of = [str(rng.choice([n for n in LOADS if n != where]))]
     if form in ('dead_band', 'saturation', 'jitter') and stage in ('psd', 'electronics'):
         of = [where]
-    if form in ('rate', 'drag') and form == 'rate':
+    if form == 'rate':
         # A delay of one's own reading is in the catalogue.
         of = [DOTS[DOTS.index(where) ^ 1]]
     if form == 'product':
@@ -131,41 +131,29 @@ def _between(t: Array, times: Sequence[float]) -> Array:
     return on
 
 
+OF_NOW: Mapping[str, Callable[[Array, float, float], Array]] = {
+    'square': lambda u, b, sign: u**2,
+    'cube': lambda u, b, sign: u**3,
+    'stop': lambda u, b, sign: np.clip(sign * u - b, 0.0, None),
+    'dead_band': lambda u, b, sign: -np.clip(u, -b, b),
+    'saturation': lambda u, b, sign: b * np.tanh(u / b) - u,
+    'magnitude': lambda u, b, sign: np.sqrt(u**2),
+    'hop': lambda u, b, sign: np.where(sign * u > b, 1.0, 0.0),
+    'stick': lambda u, b, sign: _stuck(u, 0.1 * b),
+    'product': lambda u, b, sign: u,
+}
+
+
 def added(law: Spec, known: Mapping[str, Array], t: Array, step: float) -> Array:
     """What the law adds (n,), in units of its size; ``known``: the variables on the grid ``t``."""
     form = law['form']
     scaled = [known[n] / FULL[n] for n in law['of']]
     u = np.prod(scaled, axis=0) if scaled else np.ones(len(t))
-    b, sign = law['at'], law['sign']
-    if form == 'square':
-        out = u**2
-    elif form == 'cube':
-        out = u**3
-    elif form == 'stop':
-        out = np.clip(sign * u - b, 0.0, None)
-    elif form == 'dead_band':
-        out = -np.clip(u, -b, b)
-    elif form == 'saturation':
-        out = b * np.tanh(u / b) - u
-    elif form == 'magnitude':
-        out = np.sqrt(u**2)
-    elif form == 'hop':
-        out = np.where(sign * u > b, 1.0, 0.0)
-    elif form == 'events':
-        out = _between(t, law['times'])
-    elif form == 'gain_events':
-        out = u * _between(t, law['times'])
-    elif form in ('rate', 'drag'):
+    if form in OF_NOW:
+        return np.asarray(OF_NOW[form](u, law['at'], law['sign']))
+    if form in ('events', 'gain_events'):
+        return np.asarray(u * _between(t, law['times']))
+    if form in ('rate', 'drag'):
         speed = np.gradient(u, step)
-        out = speed * np.abs(speed) if form == 'drag' else speed
-    elif form == 'fading_square':
-        out = lag(u**2, law['time_constant'], step)
-    elif form == 'stick':
-        out = _stuck(u, 0.1 * b)
-    elif form == 'resonance':
-        out = _mode(u, law['frequency'], step)
-    elif form == 'product':
-        out = u
-    else:
-        raise ValueError(form)
-    return np.asarray(out)
+        return np.asarray(speed * np.abs(speed) if form == 'drag' else speed)
+    return lag(u**2, law['time_constant'], step) if form == 'fading_square' else _mode(u, law['frequency'], step)

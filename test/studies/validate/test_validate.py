@@ -23,7 +23,7 @@ from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import FloatArray, Mark, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.study import Opened
-from psd_deflection.studies.validate import from_recordings as module
+from psd_deflection.studies.validate import validate as module
 from psd_deflection.studies.validate.agreement import Agreement, agreement
 from psd_deflection.studies.validate.clock import Motion, Offset
 from psd_deflection.studies.validate.validate import Validated, ValidateProblem, read_validate, validate
