@@ -155,9 +155,7 @@ def parts(reported: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float
 
 
 def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]:
-    device = Device()
-    device.thread.start()
-    with tempfile.TemporaryDirectory() as folder:
+    with Device() as device, tempfile.TemporaryDirectory() as folder:
         words = ['--node', device.port.name, '--folder', folder, '--seconds', f'{seconds:g}']
         child = piped('bench.cpu', *words)
         timer = threading.Timer(PATIENCE_S + seconds, child.kill)
@@ -171,15 +169,10 @@ def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]
             timer.cancel()
             child.send_signal(signal.SIGTERM)
             child.wait(60.0)
-            device.stop.set()
-            device.thread.join()
     reported = json.loads(line)
     if reported['blocks'] < ENOUGH * BLOCKS_PER_S * reported['took']:
-        print(
-            f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors, '
-            f'and the parts of the threads that wait for them come out too small',
-            file=sys.stderr,
-        )
+        words = f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors'
+        print(f'{words}, and the parts of the threads that wait for them come out too small', file=sys.stderr)
     return parts(reported)
 
 
@@ -208,7 +201,7 @@ def main() -> int:
         return node(args.node, args.folder, args.seconds)
     row = row_of(*measure(args.seconds))
     args.results.unlink(missing_ok=True)
-    keep([row], args.results)
+    keep([row], args.results, notified=False)
     return conclude('\n'.join([row.work, *(f'  {f.median:5.1f} %  {f.name}' for f in row.figures)]))
 
 

@@ -27,7 +27,7 @@ from mcap_ros2.writer import Writer
 from scipy.signal import lsim
 
 from bench.live import make_recording
-from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, notify
+from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep
 from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.devices.protocol.frames import FrameDecoder, SampleFrame, encode
 from psd_deflection.measure.pipeline import Pipeline
@@ -190,6 +190,11 @@ def conversion(times: int, minutes: float) -> list[Row]:
         def pandas_to_mcap() -> None:
             frame = pandas.read_csv(table, dtype=dict.fromkeys(CHANNELS, np.float32))
             points = np.zeros(len(frame), [('seq', '<u4'), *((c, '<f4') for c in CHANNELS)])
+            fields = [
+                {'name': f, 'offset': of, 'datatype': 6 if f == 'seq' else 7, 'count': 1}
+                for f, (_, of, *_) in (points.dtype.fields or {}).items()
+            ]
+            size, same = points.dtype.itemsize, {'is_bigendian': False, 'is_dense': True, 'fields': fields}
             points['seq'] = np.arange(len(frame))
             for channel in CHANNELS:
                 points[channel] = frame[channel]
@@ -201,20 +206,8 @@ def conversion(times: int, minutes: float) -> list[Row]:
                     block = points[first : first + 20]
                     at = int(t_ns[first])
                     header = {'stamp': {'sec': at // 10**9, 'nanosec': at % 10**9}, 'frame_id': 'psd'}
-                    message = {
-                        'header': header,
-                        'height': 1,
-                        'width': len(block),
-                        'fields': [
-                            {'name': f, 'offset': of, 'datatype': 6 if f == 'seq' else 7, 'count': 1}
-                            for f, (_, of, *_) in (points.dtype.fields or {}).items()
-                        ],
-                        'is_bigendian': False,
-                        'point_step': points.dtype.itemsize,
-                        'row_step': block.nbytes,
-                        'data': block.tobytes(),
-                        'is_dense': True,
-                    }
+                    shape = {'height': 1, 'width': len(block), 'point_step': size, 'row_step': block.nbytes}
+                    message = {'header': header, **shape, **same, 'data': block.tobytes()}
                     writer.write_message(SAMPLES, schema, message, at, at)
                 writer.finish()
 
@@ -229,31 +222,18 @@ def conversion(times: int, minutes: float) -> list[Row]:
             frame.insert(0, 't', np.arange(len(frame)) / 1000)
             frame.to_csv(new('.csv'), index=False)
 
-        def copied(source: Path) -> Callable[[], None]:
-            def copy() -> None:
-                new('.copy').write_bytes(source.read_bytes())
+        def copy() -> None:
+            new('.copy').write_bytes(table.read_bytes())
 
-            return copy
+        def row(way: str, source: Path, ending: str, by_hand: str, peer: Callable[[], None]) -> Row:
+            ours_too = ('psd_deflection convert', 'ours', lambda: ours(source, new(ending)), None)
+            limit = ('reading and writing the bytes of the CSV', 'limit', copy, None)
+            work = f'{way}, {minutes:g} minutes of samples'
+            return in_turns(work, 's', 1.0, times, ours_too, (f'{by_hand} by hand', 'peer', peer, 1.0), limit)
 
         return [
-            in_turns(
-                f'CSV to bag, {minutes:g} minutes of samples',
-                's',
-                1.0,
-                times,
-                ('psd_deflection convert', 'ours', lambda: ours(table, new('.mcap')), None),
-                ('pandas and mcap-ros2-support by hand', 'peer', pandas_to_mcap, 1.0),
-                ('reading and writing the bytes of the CSV', 'limit', copied(table), None),
-            ),
-            in_turns(
-                f'bag to CSV, {minutes:g} minutes of samples',
-                's',
-                1.0,
-                times,
-                ('psd_deflection convert', 'ours', lambda: ours(bag, new('.csv')), None),
-                ('mcap-ros2-support and pandas by hand', 'peer', mcap_to_pandas, 1.0),
-                ('reading and writing the bytes of the CSV', 'limit', copied(table), None),
-            ),
+            row('CSV to bag', table, '.mcap', 'pandas and mcap-ros2-support', pandas_to_mcap),
+            row('bag to CSV', bag, '.csv', 'mcap-ros2-support and pandas', mcap_to_pandas),
         ]
 
 
@@ -265,17 +245,11 @@ def simulation(times: int) -> list[Row]:
     model = ForwardModel(rig)
     physics = model.physics
     t = np.arange(len(loads)) * physics.period
-    modes = [
-        (2.0 * np.pi * f, z)
-        for f, z in (
-            (physics.bending_frequency, physics.bending_damping_ratio),
-            (physics.bending_frequency, physics.bending_damping_ratio),
-            (physics.torsion_frequency, physics.torsion_damping_ratio),
-        )
-    ]
+    bending = 2.0 * np.pi * physics.bending_frequency, physics.bending_damping_ratio
+    torsion = 2.0 * np.pi * physics.torsion_frequency, physics.torsion_damping_ratio
 
     def peer() -> None:
-        for axis, (w, z) in enumerate(modes):
+        for axis, (w, z) in enumerate((bending, bending, torsion)):
             lsim(([w * w], [1.0, 2.0 * z * w, w * w]), loads[:, axis], t, interp=False)
 
     arrays: list[FloatArray] = [np.zeros((3, len(t))), np.zeros((4, len(t))), np.zeros((6, len(t)))]
@@ -297,17 +271,13 @@ def simulation(times: int) -> list[Row]:
     ]
 
 
+FOUR = (
+    *('sensor_rotation,psd=2,angle=0.01', 'load_direction,angle=0.004', 'amplifier_lag,time_constant=0.0005'),
+    'bending_stiffness,scale=-0.013',
+)
 SEARCHES: tuple[tuple[str, tuple[str, ...], tuple[str, ...], float | None], ...] = (
-    ('one effect', ('sensor_rotation,psd=2,angle=0.01',), (), 1.3),
-    (
-        'four effects',
-        (
-            *('sensor_rotation,psd=2,angle=0.01', 'load_direction,angle=0.004', 'amplifier_lag,time_constant=0.0005'),
-            'bending_stiffness,scale=-0.013',
-        ),
-        (),
-        None,
-    ),
+    ('one effect', FOUR[:1], (), 1.3),
+    ('four effects', FOUR, (), None),
     ('an unknown effect', ('sensor_nonlinearity,psd=1,k=300',), ('sensor_nonlinearity',), None),
 )
 """What is missing, how it is simulated, what the library lacks, and the bound to its forward simulations."""
@@ -413,10 +383,7 @@ def main() -> int:
     }
     for name, job in jobs.items():
         if args.only in (None, name):
-            rows = job()
-            for row in rows:
-                notify(row)
-            keep(rows, args.results)
+            keep(job(), args.results)
     return 0
 
 

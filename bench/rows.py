@@ -118,7 +118,10 @@ def notify(row: Row) -> None:
         print(words, flush=True)
 
 
-def keep(rows: Sequence[Row], path: Path = RESULTS) -> None:
+def keep(rows: Sequence[Row], path: Path = RESULTS, *, notified: bool = True) -> None:
+    """Into the file of results, and printed unless not ``notified``."""
+    for row in rows if notified else ():
+        notify(row)
     by_work = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
     by_work.update((row.work, row) for row in rows)
     tree = {'machine': machine(), 'rows': [asdict(row) for row in by_work.values()]}

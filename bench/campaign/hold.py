@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import rclpy
@@ -144,13 +144,13 @@ class Campaign(Graph):
         self.spin(LONGEST_S, self.follows, f'offsets that follow after: {name}')
         return out, late
 
-    def _begin(self, name: str) -> Callable[[], None]:
+    def _begin(self, name: str) -> Callable[[], object]:
         plant = self.plant
         if name in SENT:
             number, victims = SENT[name]
             for victim in victims:
                 self.relays[victim].signal(number)
-            return lambda: self._again(victims)
+            return lambda: [self.relays[victim].again() for victim in victims]
         if name in DEFLECTIONS:
             plant.notify = DEFLECTIONS[name][0]
         elif name in JOINTS:
@@ -160,7 +160,7 @@ class Campaign(Graph):
             self._scaling.publish(Float64(data=0.0))
         elif name == 'another publisher':
             other_publisher = self.node.create_publisher(Float64MultiArray, '/compensator/offsets', 5)
-            return lambda: self._destroy(other_publisher)
+            return lambda: self.node.destroy_publisher(other_publisher)
         else:
             plant.stands = True
             plant.arm.force *= 1.4
@@ -168,13 +168,6 @@ class Campaign(Graph):
             if name == 'protective stop':
                 self._robot_runs.publish(Bool(data=False))
         return self._mend
-
-    def _again(self, victims: Sequence[str]) -> None:
-        for victim in victims:
-            self.relays[victim].again()
-
-    def _destroy(self, publisher: Any) -> None:
-        self.node.destroy_publisher(publisher)
 
     def _mend(self) -> None:
         plant = self.plant
@@ -206,9 +199,7 @@ class Campaign(Graph):
             self.compensator.process.kill()
             self.compensator.wait()
             out = Injected(max(self._changed_last() - began, 0.0))
-        self.start()
-        self.until_ready()
-        self.enable()
+        self.start_again()
         self.spin(LONGEST_S, self.follows, f'offsets that follow after: {name}')
         return out
 
@@ -245,23 +236,20 @@ def _hold(graph: Graph, share: float) -> Outcome:
     """Enable against a controller that adds ``share`` of what it reports; the offsets must hold."""
     plant = graph.plant
     plant.share = share
-    graph.start()
-    graph.until_ready()
-    graph.enable()
+    graph.start_again()
     graph.spin(HOLDS_S, lambda: 'of its offset' in graph.compensator.text)
     held = 'of its offset' in graph.compensator.text
     largest = float(np.abs(plant.held).max())
     graph.enable(False)
     graph.spin(LONGEST_S, lambda: not plant.held.any(), 'no offset')
-    return (held, f'largest offset {largest * 1e3:.2f} mrad')
+    return held, f'largest offset {largest * 1e3:.2f} mrad'
 
 
 def _droop(graph: Graph) -> Outcome:
     """Enable again and again where servos droop; no step, and afterwards the command of before."""
     plant = graph.plant
     plant.droop, plant.commands = DROOP, True
-    graph.start('--output', 'commands')
-    graph.until_ready()
+    graph.start_again('--output', 'commands', enabled=False)
     for _ in range(ENABLINGS):
         count = len(plant.offsets)
         graph.enable()
@@ -269,14 +257,12 @@ def _droop(graph: Graph) -> Outcome:
         graph.enable(False)
         graph.spin(WAY_OUT_S + LONGEST_S / 10.0, lambda: float(np.abs(plant.held).max()) < CREEP)
     crept = float(np.abs(plant.held).max())
-    return (crept < CREEP, f'crept {crept * 1e3:.3g} mrad')
+    return crept < CREEP, f'crept {crept * 1e3:.3g} mrad'
 
 
 def _followed(graph: Graph, breaks: str = 'health') -> float:
     """Start and enable; return the largest offset, rad, as soon as it compensates the load."""
-    graph.start(breaks=breaks)
-    graph.until_ready()
-    graph.enable()
+    graph.start_again(breaks=breaks)
     graph.spin(LONGEST_S, lambda: graph.plant.error() < 1e-4, 'the rigid pose')
     return float(np.abs(graph.plant.held).max())
 
@@ -292,7 +278,7 @@ def _way_out(graph: Graph) -> Outcome:
     graph.flag.unlink()
     took, allowed = graph.plant.stamps[-1] - began, largest / MAX_RATE + WAY_OUT_S
     right = not graph.plant.held.any() and took <= allowed
-    return (right, f'released in {took * 1e3:.0f} ms of {allowed * 1e3:.0f} ms')
+    return right, f'released in {took * 1e3:.0f} ms of {allowed * 1e3:.0f} ms'
 
 
 def _restarted(graph: Graph) -> Outcome:
@@ -300,8 +286,7 @@ def _restarted(graph: Graph) -> Outcome:
     _followed(graph)
     graph.compensator.send(signal.SIGKILL)
     graph.compensator.wait()
-    graph.start()
-    graph.until_ready()
+    graph.start_again(enabled=False)
     graph.spin(HOLDS_S, lambda: 'the controller applies' in graph.compensator.text)
     reported, held = 'the controller applies' in graph.compensator.text, graph.plant.held.any()
     graph.enable(False)

@@ -253,8 +253,12 @@ class Graph(Spun):
         )
         return self.compensator
 
-    def until_ready(self) -> None:
+    def start_again(self, *arguments: str, breaks: str = 'health', enabled: bool = True) -> None:
+        """Start the compensator, wait until it can be enabled, and enable it unless not ``enabled``."""
+        self.start(*arguments, breaks=breaks)
         self.spin(LONGEST_S, lambda: READY in self.compensator.text, 'the node')
+        if enabled:
+            self.enable()
 
     def enable(self, wanted: bool = True) -> None:
         client = self.node.create_client(SetBool, '/compensator/enable')
