@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.simulated_arm import SimulatedArm, largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
@@ -25,6 +27,7 @@ from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.records import FloatArray
 from tools.program import ROOT, Program
 
+NAMES = ('shoulder', 'elbow')
 NOMINAL = np.array([1.2, 0.6])
 LOAD = (0.0, 0.0, -40.0)  # N, at the end effector.
 PERIOD_S = 0.02
@@ -96,6 +99,13 @@ JOINTS: dict[str, tuple[Notify, str]] = {
     'leaping joints': (leaps, 'leap by'),
     'joints at 1e300': (wrong('position', [1e300, 1e300]), 'no positions of the joints'),
 }
+
+
+def move_to(end: FloatArray, seconds: float) -> JointTrajectory:
+    """To rest at ``end``, rad, in that time."""
+    at = Duration(seconds=seconds).to_msg()
+    point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)
+    return JointTrajectory(joint_names=list(NAMES), points=[point])
 
 
 class Spun:
