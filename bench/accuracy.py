@@ -16,7 +16,6 @@ from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
 from psd_deflection.rig.config import Rig, load_rig
 
 SETTLED_S = 10.0  # Time after the load step when the modes have decayed.
-
 CASES = {'unloaded': (0.0, 0.0, 0.0)}
 CASES |= {f'{f:g} N on the sidebar': sidebar(f) for f in (10.0, 30.0, 50.0)}
 CASES |= {f'{f:g} N on the link': direct(f) for f in (10.0, 30.0, 50.0)}

@@ -29,8 +29,6 @@ BAGS = ROOT / 'bags'
 NAMES = ('clean', 'lost_samples', 'laser_off', 'motion', 'calibrated', 'three_psds')
 KERNELS = {'Haswell': 'avx2', 'SkylakeX': 'avx512f', 'Zen': 'avx2', 'Nehalem': 'sse4_2'}
 """Kernels of OpenBLAS, each with the instructions that it needs, as /proc/cpuinfo names them."""
-
-
 FOLDER = ROOT / 'build' / 'aarch64'  # A Python for aarch64 with our versions of the libraries, for qemu to run.
 LIBRARIES = ('numpy', 'scipy', 'zstandard', 'PyYAML', 'ruamel.yaml', 'tqdm', 'pyserial')
 PLATFORMS = tuple(f'--platform=manylinux_2_{glibc}_aarch64' for glibc in (28, 27, 17))

@@ -27,12 +27,10 @@ URDF = ROOT / 'config' / 'two_links.urdf'
 PERIOD = 0.02
 LATE = 0.03
 NOISE = 1e-6  # Of a deflection, m, one standard deviation.
-
 PAYLOAD = np.array([0.0, 0.0, -20.0])
 TAKEN, MOVED, ARRIVED, LOST, BACK, ENABLED, PUT_DOWN, END = 1.0, 8.0, 11.0, 16.0, 16.5, 3.0, 20.0, 26.0
 TONES: tuple[Colour, ...] = ('blue', 'orange')
 POSES = np.array([[1.2, 0.6], [0.7, 1.3]])
-
 WINDOWS = {
     'payload held': (ENABLED + 3.0, MOVED),
     'while the arm moves': (MOVED, ARRIVED),

@@ -45,7 +45,6 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.discover.discover import discover
 
 READ_FRAMES = 18  # Frames of one read: the reader waits until a block is nearly whole.
-
 TEN = (
     *('clamp_bending_compliance,compliance=1e-4', 'damping,bending_ratio=0.02', 'creep,amplitude=0.03'),
     *('load_direction,angle=0.01', 'sensor_position,psd=1,x=1e-3', 'sensor_rotation,psd=2,angle=0.01'),

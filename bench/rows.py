@@ -22,8 +22,6 @@ import numpy.typing as npt
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / 'bench' / 'results.json'
 PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas')
-
-
 STEADY = 0.25  # Quartiles that are further apart than this share of their median: load from outside shows in them.
 
 

@@ -20,7 +20,6 @@ BLOCK = 20
 FLOOR = generator.SIGMA * generator.MM_PER_V / math.sqrt(BLOCK)
 SIZES = (1.0, 3.0, 10.0)
 NOISES = ('heavy', 'coloured', 'loud', 'flicker')  # Other noise than the rig file's.
-
 SHOWS_ACROSS_LENGTHS = frozenset(
     (
         *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
@@ -28,7 +27,6 @@ SHOWS_ACROSS_LENGTHS = frozenset(
     )
 )
 """Effects that one link length cannot distinguish; half of their cases have two lengths."""
-
 SUITE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name('suite.toml').read_text(encoding='utf-8'))
 MIMICKED: Mapping[str, str] = SUITE['mimicked']
 
@@ -310,7 +308,6 @@ def cases_by_hand(first: int, hand: int) -> Iterator[Case]:
 MISTAKES: Mapping[str, Sequence[float]] = SUITE['mistakes']
 FAULTLESS = (('gaps', 0.3), ('outliers', 0.01), ('under_load', 0.0), ('own_zeros', 3e-4))
 """Recordings that look odd and are right: share of the samples, share, nothing, m."""
-
 SPREADS = ((3.0, 30.0), (3.0, 300.0), (3.0, 30.0, 300.0))
 """Gaps of effects that act together, in floors: the small ones must not vanish behind the large ones."""
 

@@ -12,12 +12,10 @@ from scipy.signal import lfilter
 
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
-
 LOADS = ('load_fx', 'load_fy', 'load_tz')
 DOTS = ('x1', 'y1', 'x2', 'y2')
 FULL = {'load_fx': 30.0, 'load_fy': 50.0, 'load_tz': 29.0, 'temperature': 3.5, **dict.fromkeys(DOTS, 2e-3)}
 """About the largest value of each variable in the experiment, in which the shapes are drawn."""
-
 STATIC = ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'magnitude')
 OF_STAGE: Mapping[str, tuple[str, ...]] = {
     'load': ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'events', 'fading_square'),

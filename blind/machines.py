@@ -213,7 +213,6 @@ class AuxTel(Plant):
 
 EI = 91.0  # N m^2, fitted by those who measured.
 READING = 5e-4  # m rms, of a ruler with millimetres.
-
 STIFFNESS = plant_effect(
     'bending_compliance',
     EffectParameter('scale', '', -0.9, 3.0, 0.1, 'relative change of 1/EI'),

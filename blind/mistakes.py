@@ -13,7 +13,6 @@ from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import Rig, replace_values
 
 LENGTH = 0.585  # m, of the rig file.
-
 AXES = {1: [1, 0, 2, 3, 4, 5], 2: [0, 1, 2, 4, 3, 5]}
 Make = Callable[[float, Observation, np.random.Generator], list[Observation]]
 

@@ -18,7 +18,6 @@ from tools.program import WAIT_S
 
 VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390, 844, True), ('dark', 390, 844, True))
 """Colour scheme, width, height, whether it is a phone."""
-
 RUN = """
 const done = arguments[arguments.length - 1];
 // Colours on their way to others are not those that a person sees.

@@ -14,7 +14,6 @@ class AllowContract(Contract):
     """Libraries that rooms may import."""
 
     type_name = 'allow'
-
     pure = fields.ListField(subfield=fields.StringField())
     rooms = fields.ListField(subfield=fields.StringField())
 

@@ -22,7 +22,6 @@ CANNOT = {
     r'^ *ros2 bag info ': 'rosbag2_py is C++, which no registry has',
 }
 """Lines that are reported instead of run."""
-
 APT = r"""#!/bin/bash
 words=()
 for word in "$@"; do
@@ -40,7 +39,6 @@ done
 exec /usr/bin/apt-get "${words[@]}"
 """
 """apt-get that passes over what Debian has not."""
-
 SETUP = """
 export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3 AMENT_PREFIX_PATH=/opt/ros/jazzy
 export PATH=/opt/ros/jazzy/bin:$PATH PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3.*/site-packages)

@@ -18,7 +18,6 @@ from tools.rosdistro import our_rows, prepared
 
 PAGE = re.compile(r'http://127\.0\.0\.1:\d+/')
 LONGEST = 3600.0  # s: longer than this nobody waits for a step on a busy machine; an idle one needs a minute or two.
-
 ENTER = """
 mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc" && mount --bind /tmp "$1/tmp" || exit 1
 cp /etc/resolv.conf /etc/hosts "$1/etc"
@@ -27,7 +26,6 @@ exec env -i HOME=/root TERM=dumb LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive PIP
     PATH=/usr/sbin:/usr/bin:/sbin:/bin chroot "$1" sh -ec "$2"
 """
 """A shell in the chroot; its mounts end with it. In /tmp lie the locks by which the tests share the domains of ROS."""
-
 PIP = 'apt-get install -qq --no-install-recommends python3-venv >/dev/null 2>&1'
 BUILDERS = 'dpkg-dev build-essential debhelper dh-python python3-all python3-setuptools equivs'
 BUILD = f"""

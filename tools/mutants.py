@@ -27,8 +27,6 @@ EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
 NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
 """Broken files that a test has noticed, "DIGEST STAGE" a line: only what was not is tried again. Delete it to begin
 anew."""
-
-
 OPERATORS = (
     *('NumberReplacer', 'AddNot', 'ReplaceAndWithOr', 'ReplaceOrWithAnd', 'ReplaceTrueWithFalse'),
     *('ReplaceFalseWithTrue', 'ReplaceBreakWithContinue', 'ReplaceContinueWithBreak', 'ZeroIterationForLoop'),

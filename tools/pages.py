@@ -19,8 +19,6 @@ from tools.program import ROOT
 
 OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection/model/simulation/effects').glob('[a-z]*.py')}
 """Not those of the person who writes the pages."""
-
-
 _CHANNEL = re.compile(r'_(?:x|y|sum)\d$')
 
 
@@ -94,7 +92,6 @@ TABLES = {
     'effects': effects,
 }
 PAGES = tuple(ROOT / 'docs' / name for name in ('topics.md', 'commands.md', 'effects.md'))
-
 MOST_WORDS = 45_000
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 
 WAIT_S = 240.0
 """Longest wait for what is expected: with ten busy loops on two cores it may come a hundred times as late as alone."""
-
 ROOT = Path(__file__).resolve().parent.parent
 PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')  # How our own program is started in this environment.
 

@@ -226,14 +226,12 @@ TREE: tuple[Callable[[Path, bool], Iterator[str]], ...] = (
     check_rosdep,
     check_actions,
 )
-
 RENDER = """
 from rattler_build import Stage0Recipe, VariantConfig
 recipe = Stage0Recipe.from_file('packaging/conda/recipe.yaml')
 assert recipe.render(VariantConfig.from_yaml('python_min: ["3.11"]'))
 """
 """The conda recipe, rendered."""
-
 LIST_LICENCES = """
 import importlib.metadata, json
 rows = []

@@ -18,7 +18,6 @@ from tools.release import ROOT, rosdep_table
 
 SYSTEMS = {'noble': ('ubuntu', 'jazzy'), 'resolute': ('ubuntu', 'lyrical'), 'bookworm': ('debian', 'jazzy')}
 """Columns of the table: the system, and the distribution of ROS whose packages it has."""
-
 LOOK_UP = """
 import json, sys
 from rosdep2.installers import InstallerContext

@@ -39,37 +39,28 @@ INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
 DEVICE = 'ttyACM0'  # Where the simulated device is that a line with /dev/ttyACM0 gets.
 CUT = 'recordings/cut'  # A recording that a crash left without its end.
-
 _TABLES = tomllib.loads((ROOT / 'tools' / 'run_commands.toml').read_text(encoding='utf-8'))
 CI_RUNS: list[list[str]] = _TABLES['ci']
 SHORTER: dict[str, str] = _TABLES['shorter']
 TOOLS: dict[str, list[str]] = _TABLES['tools']
-
 ADMINISTRATION = re.compile(
     r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|source|ssh|sudo|systemctl|udevadm|useradd) '
 )
 """Lines for root or for another machine: never typed here. test/docs/test_docs.py checks the files they install."""
-
 HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says nothing: never run here.
-
 FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b|make release STEP=apt\b)')
 """Reads data of others, which are not in the repository."""
-
 NO_CAMPAIGNS, CLEAN = '--no-campaigns', '--clean'
-
 NEVER_HERE = ('a machine to administer', 'ros2', 'two hours', 'the data of others')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
-
 LIVE = re.compile(
     r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
     r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
 BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b|^ros2 run tf2_ros ')
 """Nodes that run beside the lines below them."""
-
 AT_THE_BENCH = re.compile(r'^psd-deflection calibrate --live\b')
 """Records with a running daemon while the lines below it load the tip."""
-
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')  # Commands that speak to a running daemon.
 
 

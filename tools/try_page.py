@@ -17,10 +17,8 @@ from tools.browser import emulate, open_browser, picture, served
 
 LIMIT_S = 1200.0
 """Longest wait for an answer: a busy machine, both cores taken, computes many times as long as an idle one."""
-
 NO_OTHER_HOST = '--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1'
 HIDDEN = (0, 'drawn', '')  # What is chosen, one after the other: the first of the list, one drawn by chance, nothing.
-
 NOTHING = 'Nothing is missing: '
 SIZE = (940, 1250)  # Of the picture.
 

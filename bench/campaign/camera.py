@@ -25,7 +25,6 @@ from psd_deflection.camera.target import target_of
 
 REST = 4
 RUN = 20  # Frames of one rendered rig, after those at rest.
-
 SIGMAS = 5.0
 
 
@@ -272,7 +271,6 @@ def accuracy_table(frames: int, seed: int) -> bool:
 
 
 BOARD_THETA = 0.003  # Largest rms error of theta by a board, degrees: a tenth of what is asked of the discs.
-
 VIEWS = {
     '640 x 480': render.Scene(focal=1700.0, roll=0.02),
     '1920 x 1080': render.Scene(width=1920, height=1080, focal=4200.0, centre=(960.0, 520.0), blur=1.0, roll=0.02),

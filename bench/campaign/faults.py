@@ -47,7 +47,6 @@ class Fault:
 
 BAD = ('bad frames',)
 AWAY = ('disconnects',)
-
 STOLEN = 512  # Bytes: some of them were samples.
 
 
@@ -309,7 +308,6 @@ FAULTS: tuple[Fault, ...] = (
         estimates=True,
     ),
 )
-
 START_S = 300.0
 RECOVER_S = 5.0
 BACK_S = 1.0  # A device that is back is read again within this.

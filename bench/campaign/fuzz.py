@@ -19,11 +19,9 @@ import zstandard
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMITS = ['-timeout=60', '-rss_limit_mb=256', '-max_len=65536']
-
 HANG_S = 1.0
 """More than this in one reading of an input is a hang, in seconds of the processor: libFuzzer's clock runs on while
 others have the machine, and stays for what never comes back at all. Coverage makes a reading three times as long."""
-
 Target = Callable[[bytes], list[str]]
 """Reads an input, and returns what the package rejects of it; whatever else it raises is a defect."""
 
@@ -357,7 +355,6 @@ def yaml_target() -> tuple[Target, list[bytes]]:
 
 
 GRAMMARS = ('hello', 'records', 'yaml')  # Targets whose input is a list of choices: any bytes are an input.
-
 TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {
     'frames': frames_target,
     'hello': hello_target,

@@ -27,9 +27,7 @@ from tools.program import ROOT
 HOLD_S = 0.2  # The offsets must not change later than this after a fault.
 RELEASE_S = 0.2  # They must be back at zero so long after the time that ``MAX_RATE`` needs.
 WITHIN = 1.0 + 1e-6  # The largest step over what the rate allows.
-
 TRIES = 5
-
 WATCHED_S = 0.4
 """How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 RELAYED = {
@@ -37,14 +35,12 @@ RELAYED = {
     'driver': ('/arm/joints', '/joint_states', JointState),
 }
 """What a process passes on: from the arm, to the compensator, and the type."""
-
 SENT: dict[str, tuple[int, tuple[str, ...]]] = {
     'estimator killed': (signal.SIGKILL, ('estimator',)),
     'DDS killed': (signal.SIGKILL, ('estimator', 'driver')),
     'DDS stopped': (signal.SIGSTOP, ('estimator', 'driver')),
 }
 """Faults that are signals, and the processes that get them."""
-
 ROBOT = ('protective stop', 'speed scaling 0', 'controller ended', 'joints do not follow', 'another publisher')
 """Faults of the robot and its controller."""
 COMPENSATOR, CONTROLLER, SHAPER, ACTION = 'compensator', 'controller', 'shaper', 'action'  # All of their faults.
@@ -226,8 +222,6 @@ WAY_OUT_S = 0.5
 ENABLINGS = 5
 DROOP = 0.005  # rad
 CREEP = 1e-9  # How far a command may be from the first one after ``ENABLINGS`` enablings, rad.
-
-
 Outcome = tuple[bool, str]
 """Whether the compensator did what it must, and with which figure."""
 

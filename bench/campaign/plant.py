@@ -35,7 +35,6 @@ NOISE = 1e-6
 MAX_RATE, FOLLOW_ERROR = CompensatorSettings().max_rate, CompensatorSettings().follow_error
 LATE_S = 0.05
 """With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
-
 Notify = Callable[[Any], bool]
 
 
@@ -224,7 +223,6 @@ URDF = ROOT / 'config' / 'two_links.urdf'
 LONGEST_S = 60.0
 ASK_AGAIN_S = 5.0
 READY = 'once it is enabled'  # What the compensator logs when it can be enabled.
-
 BREAKS = """
 import sys, time
 from pathlib import Path

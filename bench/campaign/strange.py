@@ -24,8 +24,6 @@ MAGIC = (
 )
 _SEQUENCE = re.compile(r'(?:sequence<(?P<of>.+?)(?:, \d+)?>|(?P<array>.+)\[(?P<count>\d+)\])$')
 _INTEGER = re.compile(r'(?P<sign>u?)int(?P<bits>\d+)$|(?P<byte>octet|byte|char)$')
-
-
 T = TypeVar('T', str, bytes)
 
 
