@@ -18,17 +18,7 @@ from tools.program import WAIT_S
 
 VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390, 844, True), ('dark', 390, 844, True))
 """Colour scheme, width, height, whether it is a phone."""
-RUN = """
-const done = arguments[arguments.length - 1];
-// Colours on their way to others are not those that a person sees.
-for (const way of document.getAnimations()) if (way.effect.getComputedTiming().endTime !== Infinity) way.finish();
-axe.run(document, {resultTypes: ['violations']}).then(
-  (found) => done(found.violations.map(
-    (v) => [v.id, v.help, v.nodes.map((n) => [n.target.join(' '), n.failureSummary])],
-  )),
-  (error) => done([['axe', String(error), []]]),
-);
-"""
+RUN = Path(__file__).with_suffix('.js').read_text(encoding='utf-8')
 
 
 @functools.cache

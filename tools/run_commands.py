@@ -22,8 +22,10 @@ import time
 import tomllib
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from tools.program import PSD_DEFLECTION, ROOT, Program, copy_checkout, ros_domain
 from tools.tasks import SHORTEST_BENCH, TASKS, install
@@ -205,21 +207,16 @@ def python_of(page: str, folder: Path) -> list[str]:
 
 def what_is_missing(line: str) -> str:
     """Why ``line`` cannot be run here (a missing program, or a command for root); '' if it can."""
-    if ADMINISTRATION.search(line):
-        return NEVER_HERE[0]
-    if HOURS.search(line):
-        return NEVER_HERE[2]
-    if FOREIGN.search(line):
-        return NEVER_HERE[3]
+    for pattern, need in ((ADMINISTRATION, 0), (HOURS, 2), (FOREIGN, 3)):
+        if pattern.search(line):
+            return NEVER_HERE[need]
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
 
 
 def stale() -> list[str]:
     lines = [c.line for c in commands()]
-    patterns = [p for p, *_ in CI_RUNS]
-    patterns += [
-        f'^make {kind} (NAME|STEP)={name}\\b' for kind, tasks in TASKS.items() for name in tasks if name != 'site'
-    ]
+    of_tasks = [(kind, name) for kind, tasks in TASKS.items() for name in tasks if name != 'site']
+    patterns = [*(p for p, *_ in CI_RUNS), *(f'^make {kind} (NAME|STEP)={name}\\b' for kind, name in of_tasks)]
     patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern, HOURS.pattern, FOREIGN.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
@@ -261,18 +258,9 @@ class CleanRoom:
             pip = [f'{self._venv}/bin/python', '-m', 'pip', 'uninstall', '--quiet', '--yes', *sorted(more)]
             subprocess.run(pip, check=True)
 
-    @contextlib.contextmanager
-    def typing(self, line: str) -> Iterator[None]:
+    def typing(self, line: str) -> AbstractContextManager[object]:
         """Have the variables with which ``line`` is typed."""
-        variables = self._ours if OF_THE_TOOLS.search(line) else self._reader
-        before = {**os.environ}
-        try:
-            os.environ.clear()
-            os.environ.update(variables)
-            yield
-        finally:
-            os.environ.clear()
-            os.environ.update(before)
+        return patch.dict(os.environ, self._ours if OF_THE_TOOLS.search(line) else self._reader, clear=True)
 
 
 class Reader:
@@ -314,12 +302,10 @@ class Reader:
         elif LIVE.search(line):
             self._live(line)
         elif BESIDE.search(line):
-            self._background.append(self._start(line))
-            self._background[-1].until('publishing ')
+            self._beside(line, 'publishing ')
         elif AT_THE_BENCH.search(line):
             self._serve()
-            self._background.append(self._start(line))
-            self._background[-1].until('recording to ')
+            self._beside(line, 'recording to ')
         elif ASKS.search(line):
             self._serve()
             self._to_the_end(line)
@@ -328,8 +314,7 @@ class Reader:
             self._to_the_end(f'{command} ARGS="{words}"' if command else line, verdict)
         else:
             if line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')) and not self._background:
-                self._background.append(self._start('psd-deflection estimator'))
-                self._background[-1].until(r'θ +[-+]\d')
+                self._beside('psd-deflection estimator', r'θ +[-+]\d')
                 # The daemon of ros2 meets it later than its first line.
                 self._to_the_end("timeout 60 bash -c 'until ros2 lifecycle nodes | grep -q /estimator; do :; done'")
             self._to_the_end(line)
@@ -338,6 +323,10 @@ class Reader:
         """The line in a terminal, as a person types it."""
         words = line.replace('psd-deflection', self._program, 1) if line.startswith('psd-') else line
         return Program(['bash', '-c', f'exec {words}'], self._folder, terminal=True, wait_s=WAIT_S)
+
+    def _beside(self, line: str, begun: str) -> None:
+        self._background.append(self._start(line))
+        self._background[-1].until(begun)
 
     def _to_the_end(self, line: str, verdict: str = '') -> None:
         program = self._start(line)
@@ -374,8 +363,7 @@ class Reader:
 
     def _serve(self) -> None:
         if not self._background:
-            self._background.append(self._start('psd-deflection monitor'))
-            self._background[-1].until(r'θ +[-+]\d')
+            self._beside('psd-deflection monitor', r'θ +[-+]\d')
 
     def _press(self, line: str) -> None:
         self._serve()
@@ -383,10 +371,8 @@ class Reader:
         line = line.replace('http://127.0.0.1:8790', url)
         end = time.monotonic() + WAIT_S
         while True:
-            silent = '--silent' if 'POST' in line else '--silent --fail'
-            done = subprocess.run(
-                ['bash', '-c', f'{line} {silent}'], capture_output=True, text=True, check=True, timeout=WAIT_S
-            )
+            command = ['bash', '-c', f'{line} --silent' if 'POST' in line else f'{line} --silent --fail']
+            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=WAIT_S)
             answer: dict[str, Any] = json.loads(done.stdout) if 'POST' in line else {'ok': True}
             if answer['ok'] is True:
                 return
@@ -444,13 +430,10 @@ def main() -> int:
             nonlocal failures
             lines = [c.line for c in block if only in f'{c.page}: {c.line}']
             for line in [*lines]:
-                if not campaigns and is_campaign(line):
+                if why := NO_CAMPAIGNS if not campaigns and is_campaign(line) else what_is_missing(line):
                     lines.remove(line)
-                    passed_over.setdefault(NO_CAMPAIGNS, []).append(line)
-                elif missing := what_is_missing(line):
-                    lines.remove(line)
-                    passed_over.setdefault(missing, []).append(line)
-                    failures += os.environ.get('NEED_TOOLS') == '1' and missing not in NEVER_HERE
+                    passed_over.setdefault(why, []).append(line)
+                    failures += os.environ.get('NEED_TOOLS') == '1' and why not in (NO_CAMPAIGNS, *NEVER_HERE)
             return lines
 
         at_first = {*folder.iterdir(), folder / DEVICE}
