@@ -140,7 +140,7 @@ def of_setting(setting: Setting, *words: str) -> str:
     return done.stdout
 
 
-def again(folder: Path) -> Iterator[tuple[str, Recording, Rig, Iterator[Sequence[Record]]]]:
+def again(folder: Path) -> Iterator[tuple[str, Recording, Rig, Iterator[list[Record]]]]:
     """The recordings of a folder by name, and what the pipeline of this process makes of each."""
     from psd_deflection.measure.pipeline import Pipeline
     from psd_deflection.recordings.replay.engine import open_for_replay, replayed

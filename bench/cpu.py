@@ -170,8 +170,8 @@ def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]
             child.wait(60.0)
     reported = json.loads(line)
     if reported['blocks'] < ENOUGH * BLOCKS_PER_S * reported['took']:
-        words = f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors'
-        print(f'{words}, and the parts of the threads that wait for them come out too small', file=sys.stderr)
+        slow = f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors'
+        print(f'{slow}, and the parts of the threads that wait for them come out too small', file=sys.stderr)
     return parts(reported)
 
 

@@ -125,17 +125,10 @@ def replay(times: int, minutes: float) -> list[Row]:
                 for _message in make_reader(stream).iter_messages():
                     pass
 
-        return [
-            in_turns(
-                f'replay of {minutes:g} minutes to estimates, all solvers',
-                's',
-                1.0,
-                times,
-                ('psd_deflection replay', 'ours', ours, None),
-                ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0),
-                ('bare mcap iteration of the file', 'limit', limit, 1.3),
-            )
-        ]
+        peer = ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0)
+        bare = ('bare mcap iteration of the file', 'limit', limit, 1.3)
+        work = f'replay of {minutes:g} minutes to estimates, all solvers'
+        return [in_turns(work, 's', 1.0, times, ('psd_deflection replay', 'ours', ours, None), peer, bare)]
 
 
 def _process(pipeline: Pipeline, message: Any) -> None:
@@ -257,17 +250,10 @@ def simulation(times: int) -> list[Row]:
         for array in arrays:
             np.multiply(array, 1.0001)
 
-    return [
-        in_turns(
-            'forward simulation, 60 s, ten effects',
-            'ms',
-            1e3,
-            times,
-            ('ForwardModel', 'ours', lambda: ForwardModel(rig).run(loads), None),
-            ('scipy lsim of its three modes alone', 'peer', peer, 20.0),
-            ('one pass of numpy over pose, dots and volts', 'limit', limit, None),
-        )
-    ]
+    beside = ('scipy lsim of its three modes alone', 'peer', peer, 20.0)
+    least = ('one pass of numpy over pose, dots and volts', 'limit', limit, None)
+    ours = ('ForwardModel', 'ours', lambda: ForwardModel(rig).run(loads), None)
+    return [in_turns('forward simulation, 60 s, ten effects', 'ms', 1e3, times, ours, beside, least)]
 
 
 FOUR = (
@@ -354,9 +340,8 @@ def verdicts(times: int) -> list[Row]:
             loads = ['--loads', 'identification'] * repeats
             used_by('simulate', '--out', table, *loads, '--effect', SEARCHES[0][1][0], '--seed', '5')
             lasts = len(load_history('identification', 1000.0).loads) * repeats / 1000.0
-            seconds, memory = zip(
-                *(used_by('discover', table, '--out', f'{folder}/found') for _ in range(times)), strict=True
-            )
+            runs = [used_by('discover', table, '--out', f'{folder}/found') for _ in range(times)]
+            seconds, memory = zip(*runs, strict=True)
             work, name = f'discover, {lasts:g} s in a CSV, one effect', 'psd-deflection discover'
             limit = figure('what its recording lasts', 'limit', [lasts], 1.0)
             rows.append(Row(f'{work}: from start to report', 's', [figure(name, 'ours', seconds), limit]))

@@ -32,13 +32,8 @@ def move() -> Trajectory:
 
 def played(trajectory: Trajectory) -> float:
     """Amplitude of the end effector's vibration after the trajectory, m."""
-    arm = SimulatedArm(
-        read_chain(ROOT / 'config' / 'two_links.yaml').chain,
-        START,
-        frequency=FREQUENCY,
-        damping=RATIO,
-        mass=float(np.linalg.norm(PAYLOAD)) / GRAVITY,
-    )
+    chain, mass = read_chain(ROOT / 'config' / 'two_links.yaml').chain, float(np.linalg.norm(PAYLOAD)) / GRAVITY
+    arm = SimulatedArm(chain, START, frequency=FREQUENCY, damping=RATIO, mass=mass)
     arm.force = PAYLOAD
     arm.settle()
     times = np.arange(0.0, trajectory.duration + SETTLED_S, STEP_S)
@@ -55,10 +50,8 @@ def unshaped() -> float:
 
 def residual(shaper: Shaper) -> float:
     """Amplitude after the shaped move over that after the move as it is."""
-    return (
-        played(TrajectoryShaper(shaper).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
-        / unshaped()
-    )
+    start = standing(dict(zip(NAMES, START.tolist(), strict=True)))
+    return played(TrajectoryShaper(shaper).shape(0, move(), start)) / unshaped()
 
 
 SHAPER_HEAD = ('shaper', 'longer by', '5 % too low', 'right', '5 % too high')

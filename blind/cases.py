@@ -90,21 +90,13 @@ def _damping(rng: np.random.Generator, size: float) -> dict[str, Any]:
 
 
 def _second(rng: np.random.Generator, size: float) -> dict[str, Any]:
-    return {
-        'frequency': float(rng.uniform(60.0, 110.0)),
-        'damping_ratio': float(rng.uniform(0.01, 0.03)),
-        'shares': int(rng.integers(0, 3)),
-        'gain': 1e-3 * size,
-    }
+    frequency, ratio = float(rng.uniform(60.0, 110.0)), float(rng.uniform(0.01, 0.03))
+    return {'frequency': frequency, 'damping_ratio': ratio, 'shares': int(rng.integers(0, 3)), 'gain': 1e-3 * size}
 
 
 def _ambient(rng: np.random.Generator, size: float) -> dict[str, Any]:
-    return {
-        'psd': int(rng.integers(1, 3)),
-        'x': float(rng.uniform(-3e-3, 3e-3)),
-        'y': float(rng.uniform(-3e-3, 3e-3)),
-        'level': 1e-3 * size,
-    }
+    psd, (x, y) = int(rng.integers(1, 3)), rng.uniform(-3e-3, 3e-3, 2).tolist()
+    return {'psd': psd, 'x': x, 'y': y, 'level': 1e-3 * size}
 
 
 def _mains(rng: np.random.Generator, size: float) -> dict[str, Any]:
@@ -319,9 +311,8 @@ def hard_cases(first: int, spreads: int, mistakes: int) -> Iterator[Case]:
         gaps = SPREADS[i % len(SPREADS)]
         names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], len(gaps), replace=False)]
         two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
-        yield Case(
-            f'spread-{i}-{"-".join(names)}', 'spread', 'two' if two else 'one', tuple(zip(names, gaps, strict=True))
-        )
+        wanted = tuple(zip(names, gaps, strict=True))
+        yield Case(f'spread-{i}-{"-".join(names)}', 'spread', 'two' if two else 'one', wanted)
     for name, sizes in MISTAKES.items():
         for k in range(min(mistakes, len(sizes))):
             yield Case(f'mistake-{name}-{k}-{first}', 'mistake', 'one', (), mistake=(name, float(sizes[k])))
@@ -336,13 +327,9 @@ UNSPREAD = frozenset(('amplifier_saturation', 'quantisation', 'plane_tilt', 'sen
 
 def short_cases() -> list[Case]:
     """Return a small selection to run on every change: a few of each kind."""
-    out = [
-        Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),))
-        for name, gap in (
-            *(('sensor_rotation', 3.0), ('plane_tilt', 3.0), ('creep', 3.0), ('amplifier_lag', 10.0)),
-            *(('quantisation', 3.0), ('spot_clipping', 10.0)),
-        )
-    ]
+    gaps = {'sensor_rotation': 3.0, 'plane_tilt': 3.0, 'creep': 3.0, 'amplifier_lag': 10.0, 'quantisation': 3.0}
+    listed = (*gaps.items(), ('spot_clipping', 10.0))
+    out = [Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),)) for name, gap in listed]
     out.append(Case('pair-s', 'pair', 'one', (('sensor_gain', 5.0), ('load_direction', 5.0))))
     out.append(Case('alien-s', 'alien', 'one', (('alien_square_crosstalk', 10.0),)))
     out.append(Case('spread-s', 'spread', 'one', (('sensor_rotation', 3.0), ('load_direction', 300.0))))

@@ -58,13 +58,8 @@ def simulated(
     middles = np.arange(0.0, seconds, 1.0 / rate) + float(rng.uniform(0.0, 1.0 / rate))
     within = np.linspace(-0.5, 0.5, 41) * exposure
     poses = np.mean([truth(middles + u, steps) for u in within], axis=0)
-    return ClockRecording(
-        t,
-        flat_dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4)),
-        middles - offset,
-        poses + rng.normal(0.0, REFERENCE_SD, poses.shape),
-        offset,
-    )
+    dots = flat_dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4))
+    return ClockRecording(t, dots, middles - offset, poses + rng.normal(0.0, REFERENCE_SD, poses.shape), offset)
 
 
 RIG = load_rig(None)

@@ -27,18 +27,9 @@ OF_STAGE: Mapping[str, tuple[str, ...]] = {
     ),
     'electronics': ('dead_band', 'saturation', 'events', 'gain_events', 'rate', 'fading_square', 'jitter'),
 }
-KIND_OF = {
-    **dict.fromkeys(STATIC, 'static'),
-    'hop': 'switched',
-    'events': 'switched',
-    'gain_events': 'switched',
-    'rate': 'rate',
-    'drag': 'rate',
-    'fading_square': 'history',
-    'stick': 'history',
-    'resonance': 'resonance',
-    'jitter': 'variance',
-}
+KIND_OF = dict.fromkeys(STATIC, 'static') | dict.fromkeys(('hop', 'events', 'gain_events'), 'switched')
+KIND_OF |= dict.fromkeys(('rate', 'drag'), 'rate') | dict.fromkeys(('fading_square', 'stick'), 'history')
+KIND_OF |= {'resonance': 'resonance', 'jitter': 'variance'}
 
 
 def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
@@ -81,14 +72,9 @@ def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
 
 def truth_of(law: Spec) -> dict[str, Any]:
     """What an answer must say: stage, what it acts on, variables, kind."""
-    variables = [*law['of'], *(['time'] if law['times'] else [])]
-    return {
-        'stage': law['name'].removeprefix('law_'),
-        'where': law['where'],
-        'variables': sorted(set(variables)),
-        'kind': KIND_OF[law['form']],
-        'form': law['form'],
-    }
+    form, where, variables = law['form'], law['where'], {*law['of'], *(['time'] if law['times'] else [])}
+    of = {'stage': law['name'].removeprefix('law_'), 'where': where, 'variables': sorted(variables)}
+    return {**of, 'kind': KIND_OF[form], 'form': form}
 
 
 def lag(u: Array, tau: float, step: float) -> Array:

@@ -33,13 +33,8 @@ def first_recordings() -> dict[str, tuple[Array, Array]]:
         return np.repeat(np.array([(0, 0, 0), *levels, (0, 0, 0)], dtype=np.float64), 1500, axis=0)
 
     weights = held((0, -10, -5.85), (0, -30, -17.55), (0, -50, -29.25), (0, 0, 0), (0, -30, 0), (0, -50, 0))
-    designs = {
-        'one weight': held((0, -30, 0)),
-        'sidebar': held((0, -30, -17.55)),
-        'torque': held((0, 0, 20)),
-        'sideways': held((30, 0, 0)),
-    }
-    even = {name: (loads, np.full(len(loads), 21.0)) for name, loads in designs.items()}
+    single = {'one weight': (0, -30, 0), 'sidebar': (0, -30, -17.55), 'torque': (0, 0, 20), 'sideways': (30, 0, 0)}
+    even = {name: (loads := held(load), np.full(len(loads), 21.0)) for name, load in single.items()}
     warming = np.linspace(21.0, 24.0, len(weights))
     return {**even, 'rest, warming': (np.zeros_like(weights), warming), 'weights, warming': (weights, warming)}
 
@@ -87,16 +82,9 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
     done = run_loop([first], lambda known: discover(known, RIG), record, most=MOST)
     named = [*(e.active.effect.name for e in done.discovery.effects), *(f.name for f in done.discovery.setup)]
     together = sorted(done.discovery.unsettled)
-    row |= {
-        'outcome': done.outcome,
-        'recordings': len(done.plans),
-        'named': named,
-        'together': together,
-        'left': alternatives,
-        'planned': [p.words for p in done.plans],
-        'verdict': done.discovery.verdict,
-        'right': named == [name] or (done.outcome != 'unique' and name in (*named, *together)),
-    }
+    row |= {'outcome': done.outcome, 'recordings': len(done.plans), 'named': named, 'together': together}
+    row |= {'left': alternatives, 'planned': [p.words for p in done.plans], 'verdict': done.discovery.verdict}
+    row['right'] = named == [name] or (done.outcome != 'unique' and name in (*named, *together))
     confounded = bool(done.plans) or done.outcome != 'unique'
     row['kind'] = 'confounded' if confounded else 'alone'
     if done.outcome == 'limits':
@@ -125,10 +113,7 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         more = '' if r['outcome'] != 'limits' else ', separable' if r['separable'] else ', nor would all together'
         wrong = '' if r['right'] else ' WRONG'
         lines.append(f'{words}; {r["outcome"]} after {r["recordings"]}{more}{wrong}')
-        lines += [
-            f'    {" | ".join(alternatives)}: {words}'
-            for alternatives, words in zip(r['left'], r['planned'], strict=True)
-        ]
+        lines += [f'    {" | ".join(a)}: {words}' for a, words in zip(r['left'], r['planned'], strict=True)]
     alone = [r for r in rows if r['kind'] == 'alone']
     unseen = sum(r['kind'] == 'hidden' for r in rows)
     lines.append(f'{len(rows)} recordings; {unseen} cannot show their effect')

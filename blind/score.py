@@ -48,16 +48,9 @@ def complete(answer: dict[str, Any]) -> dict[str, Any]:
     unknown = [{'law': None, **u} for u in answer.get('unknown', ())]
     message = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
     nan = math.nan
-    return {
-        'verdict': message,
-        'setup': [],
-        'remaining': {'floors': nan},
-        'gap': {'before': nan, 'after': nan, 'floor': nan, 'heldout_after': nan},
-        'provenance': {'forward_simulations': 0},
-        **answer,
-        'effects': effects,
-        'unknown': unknown,
-    }
+    gap = dict.fromkeys(('before', 'after', 'floor', 'heldout_after'), nan)
+    usual = {'verdict': message, 'setup': [], 'remaining': {'floors': nan}, 'gap': gap}
+    return {**usual, 'provenance': {'forward_simulations': 0}, **answer, 'effects': effects, 'unknown': unknown}
 
 
 def load(folder: Path, keys: Sequence[str]) -> list[Row]:
@@ -186,9 +179,8 @@ def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
         sheet.rate(f'{" or ".join(kinds)} called unknown', of, right, THRESHOLDS['unknown'], 1.0, len(kinds) == 1)
     listed = [r for r in rows if r.kind in ('single', 'pair') and r.gap >= 3.0]
     wrongly = [r for r in listed if r.answer['verdict'] == 'unknown_effect']
-    sheet.lines.append(
-        f'        truth in the library, gap >= 3 floors, and yet something called unknown: {len(wrongly)}/{len(listed)}'
-    )
+    words = 'truth in the library, gap >= 3 floors, and yet something called unknown'
+    sheet.lines.append(f'        {words}: {len(wrongly)}/{len(listed)}')
     sheet.lines += [f'          {r.key}: {_row_words(r)}' for r in wrongly]
 
 

@@ -219,13 +219,8 @@ def check_wheel(root: Path, wheel: Path) -> Iterator[str]:
         yield f'{wheel.name}: lacks what `ros2 run` looks for'
 
 
-TREE: tuple[Callable[[Path, bool], Iterator[str]], ...] = (
-    check_facts,
-    check_licence,
-    check_addresses,
-    check_rosdep,
-    check_actions,
-)
+Check = Callable[[Path, bool], Iterator[str]]
+TREE: tuple[Check, ...] = (check_facts, check_licence, check_addresses, check_rosdep, check_actions)
 RENDER = """
 from rattler_build import Stage0Recipe, VariantConfig
 recipe = Stage0Recipe.from_file('packaging/conda/recipe.yaml')
@@ -329,16 +324,14 @@ def main(argv: list[str] | None = None, root: Path = ROOT) -> int:
     problems = [problem for check in TREE for problem in check(root, release)]
     untested: list[str] = []
     if options.installed and options.tools:
-        lacks, untested = check_built(
-            root, options.dist.resolve(), options.installed.absolute(), options.tools.absolute()
-        )
+        installed, tools = options.installed.absolute(), options.tools.absolute()
+        lacks, untested = check_built(root, options.dist.resolve(), installed, tools)
         problems += lacks
     else:
         untested = ['what is built: --installed and --tools name where it is']
     if not release:
         untested.append('what only a release must have (real addresses, a date, rows of rosdep): RELEASE=1')
-    for line in (*untested, *NEVER_HERE):
-        print(f'not tried: {line}')
+    print(*(f'not tried: {line}' for line in (*untested, *NEVER_HERE)), sep='\n')
     for line in problems:
         print(f'PROBLEM: {line}')
     print('release-check: ' + (f'{len(problems)} problems' if problems else 'nothing is wrong with what was tried'))

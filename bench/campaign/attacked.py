@@ -388,9 +388,5 @@ class Shaper(Attacked):
 
 
 NODES: Mapping[str, type[Any]] = {
-    'estimator': Estimator,
-    'camera': Camera,
-    'chain': Chain,
-    'compensator': Compensator,
-    'shaper': Shaper,
+    node.__name__.lower(): node for node in (Estimator, Camera, Chain, Compensator, Shaper)
 }

@@ -29,14 +29,8 @@ SIGMAS = 5.0
 
 
 def settings_of(scene: render.Scene, rest: int = 0) -> CameraSettings:
-    return CameraSettings(
-        rest_frames=rest,
-        matrix=tuple(scene.matrix),
-        distortion=tuple(scene.distortion),
-        view=scene.view,
-        spacing=scene.spacing,
-        radius=scene.radius,
-    )
+    m, d, view, spacing, radius = tuple(scene.matrix), tuple(scene.distortion), scene.view, scene.spacing, scene.radius
+    return CameraSettings(rest_frames=rest, matrix=m, distortion=d, view=view, spacing=spacing, radius=radius)
 
 
 def random_scene(rng: np.random.Generator) -> Any:

@@ -47,15 +47,8 @@ def evaluated(target: Target, content: bytes) -> list[str]:
 
 def frames_target() -> tuple[Target, list[bytes]]:
     """The decoder: whole, and byte by byte, gives the same."""
-    from psd_deflection.devices.protocol.frames import (
-        BadFrame,
-        FrameDecoder,
-        HelloFrame,
-        PingFrame,
-        SampleFrame,
-        StatusFrame,
-        encode,
-    )
+    from psd_deflection.devices.protocol import frames
+    from psd_deflection.devices.protocol.frames import BadFrame, FrameDecoder, SampleFrame, encode
     from psd_deflection.records import MOST_PSDS
 
     @timed()
@@ -75,9 +68,8 @@ def frames_target() -> tuple[Target, list[bytes]]:
 
     seeds = [
         *(bytes((n - 2,)) + encode(SampleFrame(0, 1, 1000, tuple(range(3 * n)))) for n in range(2, MOST_PSDS + 1)),
-        encode(StatusFrame(3, None)),
-        encode(HelloFrame(1, {'serial': 'A'})),
-        encode(PingFrame(7)),
+        *(encode(frames.StatusFrame(3, None)), encode(frames.HelloFrame(1, {'serial': 'A'}))),
+        encode(frames.PingFrame(7)),
     ]
     return target, seeds
 
@@ -131,17 +123,12 @@ def bag_target() -> tuple[Target, list[bytes]]:
 
 def csv_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.recordings.read.readers import open_recording
+    from psd_deflection.recordings.recording import Recording
 
     seed = b't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz\n'
     seed += b''.join(b'%d.%03d,0,1e-3,5,-1,2,5,1,0,0\n' % (i // 1000, i % 1000) for i in range(30))
-    target = _file_target(
-        '.csv',
-        lambda path: list(open_recording(path).blocks()),
-        lambda path: list(open_recording(path).loads()),
-        lambda path: list(open_recording(path).references()),
-        lambda path: list(open_recording(path).temperatures()),
-    )
-    return target, [seed]
+    parts = (Recording.blocks, Recording.loads, Recording.references, Recording.temperatures)
+    return _file_target('.csv', *(lambda path, part=part: list(part(open_recording(path))) for part in parts)), [seed]
 
 
 def parameters_target() -> tuple[Target, list[bytes]]:
@@ -221,13 +208,8 @@ def hello_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.run.hello import HelloGate
 
     rig = load_rig()
-    good: dict[str, object] = {
-        'serial': 'A',
-        'firmware': '1',
-        'sample_rate_hz': 1000.0,
-        'channels': list(CHANNELS),
-        'volts_per_count': rig.converter.volts_per_count,
-    }
+    good: dict[str, object] = {'serial': 'A', 'firmware': '1', 'sample_rate_hz': 1000.0, 'channels': list(CHANNELS)}
+    good['volts_per_count'] = rig.converter.volts_per_count
 
     @timed()
     def target(content: bytes) -> list[str]:
@@ -355,15 +337,8 @@ def yaml_target() -> tuple[Target, list[bytes]]:
 
 
 GRAMMARS = ('hello', 'records', 'yaml')  # Targets whose input is a list of choices: any bytes are an input.
-TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {
-    'frames': frames_target,
-    'hello': hello_target,
-    'bag': bag_target,
-    'records': records_target,
-    'csv': csv_target,
-    'parameters': parameters_target,
-    'yaml': yaml_target,
-}
+EVERY = (frames_target, hello_target, bag_target, records_target, csv_target, parameters_target, yaml_target)
+TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {f.__name__.removesuffix('_target'): f for f in EVERY}
 """Each target with inputs to begin from, of which the first is whole."""
 
 
@@ -407,10 +382,9 @@ def corrupted(count: int) -> int:
             print(f'accepted with another content: {bytes(damaged).hex()}')
         else:
             lost += 1
-    print(
-        f'{count} damaged frames: {rejected} rejected, {same} came out as they were sent, '
-        f'{lost} taken for another kind, {wrong} accepted with a wrong content (chance alone: {count * 2.0**-32:.4f})'
-    )
+    print(f'{count} damaged frames: {rejected} rejected, {same} came out as they were sent,', end=' ')
+    chance_alone = f'(chance alone: {count * 2.0**-32:.4f})'
+    print(f'{lost} taken for another kind, {wrong} accepted with a wrong content {chance_alone}')
     return 1 if wrong else 0
 
 

@@ -146,7 +146,7 @@ class Campaign(Graph):
             number, victims = SENT[name]
             for victim in victims:
                 self.relays[victim].signal(number)
-            return lambda: [self.relays[victim].again() for victim in victims]
+            return lambda: self._again(victims)
         if name in DEFLECTIONS:
             plant.notify = DEFLECTIONS[name][0]
         elif name in JOINTS:
@@ -164,6 +164,10 @@ class Campaign(Graph):
             if name == 'protective stop':
                 self._robot_runs.publish(Bool(data=False))
         return self._mend
+
+    def _again(self, victims: Sequence[str]) -> None:
+        for victim in victims:
+            self.relays[victim].again()
 
     def _mend(self) -> None:
         plant = self.plant

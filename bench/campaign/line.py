@@ -34,14 +34,8 @@ Tamper = Callable[[int, bytes], bytes | None]
 
 def hello_of(serial: str = SERIAL, rate: float = 1000.0) -> protocol.HelloFrame:
     """What the device says of itself."""
-    info: dict[str, object] = {
-        'serial': serial,
-        'firmware': 'campaign',
-        'sample_rate_hz': rate,
-        'channels': list(CHANNELS),
-        'volts_per_count': VOLTS_PER_COUNT,
-    }
-    return protocol.HelloFrame(1, info)
+    info: dict[str, object] = {'serial': serial, 'firmware': 'campaign', 'sample_rate_hz': rate}
+    return protocol.HelloFrame(1, {**info, 'channels': list(CHANNELS), 'volts_per_count': VOLTS_PER_COUNT})
 
 
 def identities(volts: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
