@@ -95,14 +95,10 @@ def rms(ran: Ran, window: tuple[float, float]) -> float:
 def chart(without: Ran, ran: Ran) -> Chart:
     events = ((TAKEN, 'payload'), (ENABLED, 'enabled'), (MOVED, 'move'), (LOST, 'no estimates'), (PUT_DOWN, 'put down'))
     rules = [Rule(t, what) for t, what in events]
-    errors = (
-        Series('without', without.t, without.error * 1e3, 'quiet'),
-        Series('with', ran.t, ran.error * 1e3, 'blue'),
-    )
-    joints = [
-        Series(name, ran.t, column * 1e3, tone)
-        for name, tone, column in zip(('shoulder', 'elbow'), TONES, ran.offsets.T, strict=True)
-    ]
+    both: tuple[tuple[str, Ran, Colour], ...] = (('without', without, 'quiet'), ('with', ran, 'blue'))
+    errors = [Series(name, each.t, each.error * 1e3, tone) for name, each, tone in both]
+    named = zip(('shoulder', 'elbow'), TONES, ran.offsets.T, strict=True)
+    joints = [Series(name, ran.t, column * 1e3, tone) for name, tone, column in named]
     held = ran.held > 0
     joints.append(Series('held', np.tile(ran.t[held], 2), ran.offsets[held].T.ravel() * 1e3, 'red', 'points'))
     panels = (

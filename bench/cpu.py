@@ -97,12 +97,9 @@ class Clocks:
             used = int((task / 'schedstat').read_text().split()[0])
             number = int(task.name)
             name = names.get(number) or (task / 'comm').read_text().strip()
-            out[task.name] = {
-                'name': re.sub(r'[.0-9]+$|_?\d+$', '', name) or name,
-                'used': used,
-                'spent': dict(self.spent[number]),
-                'calls': sum(self.calls[number].values()),
-            }
+            shown = re.sub(r'[.0-9]+$|_?\d+$', '', name) or name
+            spent, calls = dict(self.spent[number]), sum(self.calls[number].values())
+            out[task.name] = {'name': shown, 'used': used, 'spent': spent, 'calls': calls}
         return out
 
 

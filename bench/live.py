@@ -407,9 +407,7 @@ def main() -> int:
         roles[args.role]()
     else:
         rows = live(args.seconds, args.settle, args.rounds)
-        if args.starts:
-            rows.append(start(args.starts))
-        keep(rows, args.results)
+        keep([*rows, start(args.starts)] if args.starts else rows, args.results)
     return 0
 
 

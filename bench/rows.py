@@ -93,9 +93,8 @@ def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
             began = time.perf_counter()
             job()
             taken.append((time.perf_counter() - began) * scale)
-    return Row(
-        work, unit, [figure(n, kind, taken, bound) for (n, kind, _, bound), taken in zip(jobs, seconds, strict=True)]
-    )
+    both = zip(jobs, seconds, strict=True)
+    return Row(work, unit, [figure(name, kind, taken, bound) for (name, kind, _, bound), taken in both])
 
 
 def piped(module: str, *words: str) -> subprocess.Popen[str]:
@@ -137,12 +136,7 @@ def machine() -> dict[str, object]:
     """Where and of what the figures are; the load of the machine by others, of which the spread comes."""
     processor = re.search(r'model name\s*: (.+)', Path('/proc/cpuinfo').read_text(encoding='utf-8'))
     done = subprocess.run(['git', 'rev-parse', '--short=10', 'HEAD'], cwd=ROOT, capture_output=True, text=True)
-    return {
-        'date': datetime.now(UTC).date().isoformat(),
-        'commit': done.stdout.strip(),
-        'processor': processor[1] if processor else platform.machine(),
-        'cores': os.cpu_count(),
-        'load': round(os.getloadavg()[0], 1),
-        'python': platform.python_version(),
-        'versions': {name: importlib.metadata.version(name) for name in PACKAGES},
-    }
+    out: dict[str, object] = {'date': datetime.now(UTC).date().isoformat(), 'commit': done.stdout.strip()}
+    out |= {'processor': processor[1] if processor else platform.machine(), 'cores': os.cpu_count()}
+    out |= {'load': round(os.getloadavg()[0], 1), 'python': platform.python_version()}
+    return out | {'versions': {name: importlib.metadata.version(name) for name in PACKAGES}}

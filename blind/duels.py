@@ -73,10 +73,8 @@ def bent(plant: Plant, y: FloatArray) -> Residual:
         def apart(x: FloatArray) -> FloatArray:
             return y - _vector(plant.simulate(_model(used, x)))
 
-        def subset(x: FloatArray) -> FloatArray:
-            return apart(x)[observed]
-
-        return apart(np.asarray(least_squares(subset, start, bounds=(low, high), x_scale=size).x))
+        fitted = least_squares(lambda x: apart(x)[observed], start, bounds=(low, high), x_scale=size)
+        return apart(np.asarray(fitted.x))
 
     return residual
 
@@ -102,9 +100,8 @@ def forward_backward(plant: Plant, residual: Residual, observed: BoolArray) -> F
 def stlsq(plant: Plant, y: FloatArray, observed: BoolArray) -> FloatArray:
     """The same by sequentially thresholded least squares (Brunton and others 2016), with the threshold by BIC."""
     nothing = _vector(plant.simulate({}))
-    table = np.column_stack(
-        [_vector(plant.simulate(_model([e], np.ones(1)))) - nothing for e in (*plant.nuisance, *plant.library)]
-    )
+    alone = (plant.simulate(_model([e], np.ones(1))) for e in (*plant.nuisance, *plant.library))
+    table = np.column_stack([_vector(simulated) - nothing for simulated in alone])
     table /= np.sqrt(np.mean(table[observed] ** 2, axis=0))
     always, count, best = len(plant.nuisance), int(observed.sum()), (np.inf, y)
     for threshold in THRESHOLDS:

@@ -57,17 +57,10 @@ def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
     if form == 'events':
         of = []
     times = np.sort(rng.uniform(2.0, 22.0, int(rng.integers(1, 5)))).tolist() if 'events' in form else []
-    return {
-        'name': f'law_{stage}',
-        'form': form,
-        'where': where,
-        'of': of,
-        'at': float(rng.uniform(0.15, 0.6)),
-        'sign': float(rng.choice((-1.0, 1.0))),
-        'time_constant': float(np.exp(rng.uniform(math.log(0.2), math.log(4.0)))),
-        'frequency': float(rng.uniform(30.0, 70.0)),
-        'times': [round(t, 3) for t in times],
-    }
+    out: dict[str, Any] = {'name': f'law_{stage}', 'form': form, 'where': where, 'of': of}
+    out |= {'at': float(rng.uniform(0.15, 0.6)), 'sign': float(rng.choice((-1.0, 1.0)))}
+    out['time_constant'] = float(np.exp(rng.uniform(math.log(0.2), math.log(4.0))))
+    return {**out, 'frequency': float(rng.uniform(30.0, 70.0)), 'times': [round(t, 3) for t in times]}
 
 
 def truth_of(law: Spec) -> dict[str, Any]:

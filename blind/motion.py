@@ -343,11 +343,10 @@ def table(by_kind: Mapping[str, list[Figures]]) -> str:
         for name, f in zip(AXES, axes, strict=True):
             unit, micro = ('mm/s', 'µm') if name != 'theta' else ('mrad/s', 'µrad')
             ratio = f.velocity / f.velocity_sd
-            rows.append(
-                f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.velocity_sd * 1e3:.3f} | {ratio:.2f} '
-                f'| {f.velocity / f.smoothed:.3f} | {f.nis:.3f} | {f.inside:.1%} '
-                f'| {f.predicted * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
-            )
+            cells = [f'{f.velocity * 1e3:.3f} {unit}', f'{f.velocity_sd * 1e3:.3f}', f'{ratio:.2f}']
+            cells += [f'{f.velocity / f.smoothed:.3f}', f'{f.nis:.3f}', f'{f.inside:.1%}']
+            errors = f'{f.predicted * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
+            rows.append(' | '.join([f'| {kind}', name, *cells, errors]))
     return '\n'.join(rows)
 
 

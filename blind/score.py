@@ -85,16 +85,11 @@ def covered(row: Row) -> list[tuple[str, bool]]:
             # With other choices it is another effect, whose parameters are not those of the truth.
             if any(k in t and isinstance(v, int) and int(t[k]) != v for k, v in fitted.items()):
                 continue
+            known = {f'amplitude_{c}': v for c, v in zip(CHANNELS, t.get('amplitude', ()), strict=False)} | t
             for name, value in fitted.items():
-                if not isinstance(value, dict) or value['sd'] <= 0.0:
-                    continue
-                if name in t:
-                    true = float(t[name])
-                elif name.startswith('amplitude_') and 'amplitude' in t:
-                    true = float(t['amplitude'][CHANNELS.index(name.removeprefix('amplitude_'))])
-                else:
-                    continue
-                out.append((f'{row.key}:{name}', abs(value['value'] - true) <= 1.96 * value['sd']))
+                if isinstance(value, dict) and value['sd'] > 0.0 and name in known:
+                    inside = abs(value['value'] - float(known[name])) <= 1.96 * value['sd']
+                    out.append((f'{row.key}:{name}', inside))
     return out
 
 
@@ -154,7 +149,7 @@ def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
     hit = [bool(r.sets) and r.truth[0]['name'] in r.sets[0] for r in single]
     sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, wanted, 1.0, True)
     if single:
-        size, most = float(np.mean([len(r.sets[0]) if r.sets else 1 for r in single])), THRESHOLDS['mean_set_size']
+        size, most = np.mean([len(r.sets[0]) if r.sets else 1 for r in single]), THRESHOLDS['mean_set_size']
         sheet.check(size <= most, f'mean size of that set: {size:.2f}, wanted <= {most}')
     apart = [r for r in single if r.separated]
     first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]

@@ -21,6 +21,9 @@ VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390,
 RUN = Path(__file__).with_suffix('.js').read_text(encoding='utf-8')
 
 
+READY = 'return document.readyState === "complete"'
+
+
 @functools.cache
 def axe_source() -> str:
     """The text of axe.min.js. SystemExit, with the fix, if it is not installed."""
@@ -70,9 +73,7 @@ def main() -> int:
                 driver.execute_script('localStorage.clear()')
                 for page in pages[number :: len(VIEWS)] if args.in_turn else pages:
                     driver.get(f'{address}/{page}')
-                    WebDriverWait(driver, WAIT_S).until(
-                        lambda d: d.execute_script('return document.readyState') == 'complete'
-                    )
+                    WebDriverWait(driver, WAIT_S).until(lambda d: d.execute_script(READY))
                     for line in violations(driver):
                         failures += 1
                         print(f'{page} ({view}): {line}', flush=True)

@@ -120,12 +120,9 @@ def main() -> int:
         qemu.end()
     counters = session.acquisition.counters
     lost = f'{counters.lost} lost ({counters.device_overruns} dropped by the device)'
-    print(
-        f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {lost}, {checked.wrong} wrong,',
-        end=' ',
-    )
-    print(f'{bad + counters.bad} bad frames, {counters.restarts} restarts, skew {clock.skew_ppm:.1f} ppm,', end=' ')
-    print(f'PING median {trip * 1e3:.2f} ms')
+    print(f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {lost},', end=' ')
+    print(f'{checked.wrong} wrong, {bad + counters.bad} bad frames, {counters.restarts} restarts,', end=' ')
+    print(f'skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms')
     # On a busy host the device in qemu drops samples: those sent and those reported as dropped must make up the time.
     enough = checked.enough.is_set() and checked.samples + counters.lost >= 0.95 * 1000 * checked.span_s
     enough = enough and checked.samples > 1000

@@ -64,14 +64,9 @@ class Program:
     ) -> None:
         self._wait_s = wait_s
         self._fd, theirs = pty.openpty() if terminal else os.pipe()
+        nothing, ours = subprocess.DEVNULL, {**os.environ, 'PYTHONUNBUFFERED': '1', **(env or {})}
         self.process = subprocess.Popen(
-            command,
-            cwd=cwd,
-            stdin=subprocess.DEVNULL,
-            stdout=theirs,
-            stderr=theirs,
-            start_new_session=True,
-            env={**os.environ, 'PYTHONUNBUFFERED': '1', **(env or {})},
+            command, cwd=cwd, stdin=nothing, stdout=theirs, stderr=theirs, start_new_session=True, env=ours
         )
         os.close(theirs)
         self._output = b''

@@ -43,13 +43,10 @@ def facts(root: Path) -> Facts:
     if version is None or newest is None:
         raise ValueError('psd_deflection/__init__.py has no __version__, or CHANGELOG.md no line `## 1.2.3 (date)`')
     maintainer = package.find('maintainer')
-    return Facts(
-        version=version[1],
-        date='' if newest[2] == 'unreleased' else newest[2],
-        description=package.findtext('description', ''),
-        email='' if maintainer is None else maintainer.get('email', ''),
-        urls={str(e.get('type')): e.text or '' for e in package.iter('url')},
-    )
+    date = '' if newest[2] == 'unreleased' else newest[2]
+    email = '' if maintainer is None else maintainer.get('email', '')
+    urls = {str(e.get('type')): e.text or '' for e in package.iter('url')}
+    return Facts(version[1], date, package.findtext('description', ''), email, urls)
 
 
 def _rst(text: str) -> str:
@@ -148,10 +145,9 @@ def check_licence(root: Path, release: bool) -> Iterator[str]:
     licence = root / 'LICENSE'
     if not licence.is_file() or 'Apache License' not in licence.read_text():
         yield 'LICENSE: missing, or not the Apache License'
-    if f'license = {LICENCE}\n' not in (root / 'setup.cfg').read_text():
-        yield f'setup.cfg: the licence is not {LICENCE}'
-    if f'>{LICENCE}</license>' not in (root / 'package.xml').read_text():
-        yield f'package.xml: the licence is not {LICENCE}'
+    for name, text in (('setup.cfg', f'license = {LICENCE}\n'), ('package.xml', f'>{LICENCE}</license>')):
+        if text not in (root / name).read_text():
+            yield f'{name}: the licence is not {LICENCE}'
     for folder in root.glob('psd_deflection/**/vendor'):
         if not any('LICEN' in p.name.upper() for p in folder.iterdir()):
             yield f'{folder.relative_to(root)}: what is not ours has no licence beside it'
@@ -213,10 +209,9 @@ def check_wheel(root: Path, wheel: Path) -> Iterator[str]:
             name = str(path.relative_to(root))
             if path.is_file() and '__pycache__' not in name and name not in inside:
                 yield f'{wheel.name}: lacks {name}'
-    if not any(name.endswith('/LICENSE') for name in inside):
-        yield f'{wheel.name}: lacks LICENSE'
-    if not any(name.endswith('share/psd_deflection/package.xml') for name in inside):
-        yield f'{wheel.name}: lacks what `ros2 run` looks for'
+    for end, what in (('/LICENSE', 'LICENSE'), ('share/psd_deflection/package.xml', 'what `ros2 run` looks for')):
+        if not any(name.endswith(end) for name in inside):
+            yield f'{wheel.name}: lacks {what}'
 
 
 Check = Callable[[Path, bool], Iterator[str]]

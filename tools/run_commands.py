@@ -402,15 +402,9 @@ def main() -> int:
         full = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
         (folder / CUT).mkdir(parents=True)
         (folder / CUT / 'cut_0.mcap').write_bytes(full[: len(full) * 6 // 10])
-        os.environ.update(
-            PATH=f'{environment / "bin"}:{os.environ["PATH"]}',
-            VIRTUAL_ENV=str(environment),
-            VENV=str(environment),
-            MAKEFLAGS=f'VENV={environment}',
-            ROS_DOMAIN_ID=str(domain),
-            ROS_LOG_DIR=f'{temporary}/log',
-            XDG_STATE_HOME=f'{temporary}/state',
-        )
+        ours = {'VIRTUAL_ENV': str(environment), 'VENV': str(environment), 'MAKEFLAGS': f'VENV={environment}'}
+        places = {'ROS_LOG_DIR': f'{temporary}/log', 'XDG_STATE_HOME': f'{temporary}/state'}
+        os.environ.update(ours | places, ROS_DOMAIN_ID=str(domain), PATH=f'{environment / "bin"}:{os.environ["PATH"]}')
         room = CleanRoom(folder, Path(temporary)) if CLEAN in sys.argv else None
         reader = Reader(folder, room)
         if shutil.which('ros2'):

@@ -70,9 +70,7 @@ def main() -> int:
                 hidden = answered(driver, choice)
                 message = text(driver, 'answer')
                 failures += wrong(hidden, message)
-                print(
-                    f'{hidden}: {message.splitlines()[0]}\n{text(driver, "steps")}\n{text(driver, "state")}', flush=True
-                )
+                print(f'{hidden}: {message.splitlines()[0]}', text(driver, 'steps'), text(driver, 'state'), sep='\n')
                 if choice != HIDDEN[0]:
                     continue
                 if args.picture is not None:

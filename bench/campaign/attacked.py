@@ -387,6 +387,5 @@ class Shaper(Attacked):
         return f'{self._shaped} trajectories shaped; largest step {self.step:.4f} of speed * {KINK_S:g} s'
 
 
-NODES: Mapping[str, type[Any]] = {
-    node.__name__.lower(): node for node in (Estimator, Camera, Chain, Compensator, Shaper)
-}
+EVERY = (Estimator, Camera, Chain, Compensator, Shaper)
+NODES: Mapping[str, type[Any]] = {node.__name__.lower(): node for node in EVERY}

@@ -394,11 +394,9 @@ def everything(words: list[str]) -> int:
     parser.add_argument('--seconds', type=float, default=600.0, help='of each target and of the messages')
     parser.add_argument('--frames', type=int, default=10_000_000)
     options = parser.parse_args(words)
-    runs = [
-        ['fuzz', 'corrupted', str(options.frames)],
-        ['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)],
-        *(['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS),
-    ]
+    runs = [['fuzz', 'corrupted', str(options.frames)]]
+    runs.append(['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)])
+    runs += [['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS]
     for module, *arguments in runs:
         status = subprocess.run([sys.executable, '-m', f'bench.campaign.{module}', *arguments], check=False).returncode
         if status:

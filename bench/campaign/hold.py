@@ -342,14 +342,11 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     wanted = names if COMPENSATOR in args.only else [name for name in args.only if name in names]
     missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
-    wrong = CONTROLLER_FAULTS if CONTROLLER in args.only else [n for n in args.only if n in CONTROLLER_FAULTS]
-    for name in wrong:
+    for name in CONTROLLER_FAULTS if CONTROLLER in args.only else [n for n in args.only if n in CONTROLLER_FAULTS]:
         failed, step = controller_faults(name, args.times)
         missed, worst = missed + failed, max(worst, step)
-    if SHAPER in args.only:
-        worst = max(worst, shaper_faults(args.times))
-    if ACTION in args.only:
-        worst = max(worst, action_faults(args.times))
+    for name, faults in ((SHAPER, shaper_faults), (ACTION, action_faults)):
+        worst = max(worst, faults(args.times) if name in args.only else 0.0)
     return conclude(f'largest step of all: {worst:.3f} of what the rate allows', not missed and worst <= WITHIN)
 
 
@@ -370,12 +367,10 @@ def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
             slow += sum(r.released > r.allowed for r in released)
             step = campaign.plant.step(heard - 1)
             worst = max(worst, step)
-            print(
-                f'{name:24}{len(reactions):4} times (and {campaign.repeated} repeated): held after {_most(held)}; '
-                f'released in {_most([r.released for r in released])} '
-                f'of {_most([r.allowed for r in released])}; largest step {step:.3f} of max_rate * dt',
-                flush=True,
-            )
+            times_words = f'{len(reactions):4} times (and {campaign.repeated} repeated)'
+            took, may = (_most([getattr(r, word) for r in released]) for word in ('released', 'allowed'))
+            words = f'held after {_most(held)}; released in {took} of {may}; largest step {step:.3f} of max_rate * dt'
+            print(f'{name:24}{times_words}: {words}', flush=True)
     finally:
         campaign.close()
     print(f'held later than {HOLD_S * 1e3:g} ms: {late}; released later than offset/max_rate + 0.2 s: {slow}')
