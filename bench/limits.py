@@ -12,7 +12,7 @@ import tempfile
 import time
 import unittest.mock
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -84,19 +84,13 @@ def frames(times: int) -> list[Row]:
 
     if ours(pieces) != len(counts) or peer(pieces) != len(counts):
         raise SystemExit('frames were lost')
-    per_frame = 1e6 / len(counts)
-    return [
-        in_turns(
-            f'frame decoding, {what}',
-            'us a frame',
-            per_frame,
-            times,
-            ('FrameDecoder', 'ours', partial(ours, received), None),
-            ('cobs + struct, frame by frame', 'peer', partial(peer, received), bound),
-            ('split and crc32 of the same bytes', 'limit', partial(limit, received), None),
-        )
-        for what, received, bound in (('in pieces as they are read', pieces, 1.0), ('at once', [stream], 5.0))
-    ]
+    rows = []
+    for what, received, bound in (('in pieces as they are read', pieces, 1.0), ('at once', [stream], 5.0)):
+        decoder = ('FrameDecoder', 'ours', partial(ours, received), None)
+        beside = ('cobs + struct, frame by frame', 'peer', partial(peer, received), bound)
+        least = ('split and crc32 of the same bytes', 'limit', partial(limit, received), None)
+        rows.append(in_turns(f'frame decoding, {what}', 'us a frame', 1e6 / len(counts), times, decoder, beside, least))
+    return rows
 
 
 def replay(times: int, minutes: float) -> list[Row]:
@@ -106,19 +100,16 @@ def replay(times: int, minutes: float) -> list[Row]:
         rig = rig_at_start(open_recording(path))
 
         def ours() -> None:
-            recording = open_recording(path)
             pipeline = Pipeline(rig)
-            for _records in replayed(recording, pipeline):
+            for _records in replayed(open_recording(path), pipeline):
                 pass
             if pipeline.counters.samples != n:
                 raise SystemExit(f'replay saw {pipeline.counters.samples} of {n} samples')
 
         def by_mcap_ros2() -> None:
             pipeline = Pipeline(rig)
-            with file.open('rb') as stream:
-                messages = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
-                for _, _, _, message in messages:
-                    _process(pipeline, message)
+            for message in _decoded(file):
+                _process(pipeline, message)
 
         def limit() -> None:
             with file.open('rb') as stream:
@@ -129,6 +120,12 @@ def replay(times: int, minutes: float) -> list[Row]:
         bare = ('bare mcap iteration of the file', 'limit', limit, 1.3)
         work = f'replay of {minutes:g} minutes to estimates, all solvers'
         return [in_turns(work, 's', 1.0, times, ('psd_deflection replay', 'ours', ours, None), peer, bare)]
+
+
+def _decoded(file: Path) -> Iterator[Any]:
+    with file.open('rb') as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        yield from (message for _, _, _, message in reader.iter_decoded_messages([SAMPLES]))
 
 
 def _process(pipeline: Pipeline, message: Any) -> None:
@@ -146,12 +143,8 @@ _DTYPES = {2: 'u1', 5: '<i4', 6: '<u4', 7: '<f4', 8: '<f8'}
 
 
 def _points(message: Any) -> npt.NDArray[np.void]:
-    layout = {
-        'names': [f.name for f in message.fields],
-        'formats': [_DTYPES[f.datatype] for f in message.fields],
-        'offsets': [f.offset for f in message.fields],
-        'itemsize': message.point_step,
-    }
+    names, formats, offsets = zip(*((f.name, _DTYPES[f.datatype], f.offset) for f in message.fields), strict=True)
+    layout = {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': message.point_step}
     points: npt.NDArray[np.void] = np.frombuffer(bytes(message.data), np.dtype(cast(Any, layout)))
     return points
 
@@ -204,12 +197,7 @@ def conversion(times: int, minutes: float) -> list[Row]:
                 writer.finish()
 
         def mcap_to_pandas() -> None:
-            parts = []
-            with bag.open('rb') as stream:
-                messages = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
-                for _, _, _, message in messages:
-                    parts.append(_points(message))
-            points = np.concatenate(parts)
+            points = np.concatenate([_points(message) for message in _decoded(bag)])
             frame = pandas.DataFrame({c: points[c] for c in CHANNELS})
             frame.insert(0, 't', np.arange(len(frame)) / 1000)
             frame.to_csv(new('.csv'), index=False)

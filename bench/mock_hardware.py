@@ -78,7 +78,7 @@ def run(*words: str) -> None:
 
 
 def started(*words: str, until: str) -> Program:
-    out = Program(list(words))
+    out = Program(words)
     out.until(until)
     return out
 

@@ -62,6 +62,6 @@ def rows() -> list[tuple[str, ...]]:
     out = []
     for kind in KINDS:
         shares = [residual(shaper(kind, FREQUENCY * wrong, RATIO)) for wrong in WRONG]
-        longer = shaper(kind, FREQUENCY, RATIO).duration
-        out.append((kind.upper(), f'{1e3 * longer:.0f} ms', *(f'{100.0 * share:.1f} %' for share in shares)))
+        longer = f'{1e3 * shaper(kind, FREQUENCY, RATIO).duration:.0f} ms'
+        out.append((kind.upper(), longer, *(f'{100.0 * share:.1f} %' for share in shares)))
     return out

@@ -79,7 +79,6 @@ def main() -> None:
     blocks = parser.parse_args().blocks
     geometry = thesis_geometry()
     dots = some_blocks(blocks)
-
     print(f'{blocks} blocks at once, with covariance, residual and status')
     seconds = []
     solver = make_solver('exact', geometry)
@@ -90,7 +89,6 @@ def main() -> None:
     peer = best_of(functools.partial(peer_least_squares, dots[:500]), 3) / 500
     ratio = peer / seconds[0]
     print(f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us, exact is {ratio:.0f} times as fast')
-
     print('one block at a time, with covariance')
     sample = tuple(dots[0].tolist())
     default = 0.0

@@ -20,12 +20,10 @@ BLOCK = 20
 FLOOR = generator.SIGMA * generator.MM_PER_V / math.sqrt(BLOCK)
 SIZES = (1.0, 3.0, 10.0)
 NOISES = ('heavy', 'coloured', 'loud', 'flicker')  # Other noise than the rig file's.
-SHOWS_ACROSS_LENGTHS = frozenset(
-    (
-        *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
-        *('self_weight', 'mount_tilt', 'tip_force'),
-    )
-)
+SHOWS_ACROSS_LENGTHS = {
+    *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+    *('self_weight', 'mount_tilt', 'tip_force'),
+}
 """Effects that one link length cannot distinguish; half of their cases have two lengths."""
 SUITE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name('suite.toml').read_text(encoding='utf-8'))
 MIMICKED: Mapping[str, str] = SUITE['mimicked']

@@ -17,7 +17,10 @@ from psd_deflection.studies.validate.clock import Motion, Offset, clock_offset
 MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))  # Hz, and m, m, rad a step.
 
 
-def truth(t: Array, steps: tuple[float, ...] = (1.0, 3.7)) -> Array:
+Steps = tuple[float, ...]
+
+
+def truth(t: Array, steps: Steps = (1.0, 3.7)) -> Array:
     """Poses (k, 3) at ``t``, s: steps up and down in turn, each with its ringing (damping ratio 0.02)."""
     out = np.zeros((len(t), 3))
     for number, start in enumerate(steps):
@@ -44,12 +47,7 @@ REFERENCE_SD = np.array([10e-6, 10e-6, 3e-4])
 
 
 def simulated(
-    seed: int,
-    *,
-    seconds: float = 6.0,
-    rate: float = 30.0,
-    exposure: float = 0.008,
-    steps: tuple[float, ...] = (1.0, 3.7),
+    seed: int, *, seconds: float = 6.0, rate: float = 30.0, exposure: float = 0.008, steps: Steps = (1.0, 3.7)
 ) -> ClockRecording:
     """Samples at 1 kHz with 2 µm of noise, and a camera at ``rate`` a second that takes means over ``exposure``, s."""
     rng = np.random.default_rng(seed)

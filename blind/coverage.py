@@ -214,8 +214,8 @@ def volts_of(row: Row, clean: Array, seed: int) -> Array:
     """What the converter gives, (n, 6) V."""
     out = clean + generator.electronic_noise(len(clean), seed, sigmas=row.sigmas, memory=row.memory, heavy=row.heavy)
     if row.corner:
-        rng = np.random.default_rng(seed)
-        out = clean + np.asarray(row.sigmas) * generator.flicker(len(clean), row.corner, rng)
+        flicker = generator.flicker(len(clean), row.corner, np.random.default_rng(seed))
+        out = clean + np.asarray(row.sigmas) * flicker
     t = np.arange(len(clean)) / generator.RATE
     out += row.hum * np.sin(2.0 * np.pi * row.mains * t)[:, None] * HUMS
     if row.offsets:
@@ -255,9 +255,8 @@ def score(
 ) -> Scored:
     """At rest from block 200 on, then a step of 50 N every 5 s."""
     clean, truth = motion(rest_s, steps, size=size)
-    if loss in IN_STEP:
-        here = ~np.isin(np.arange(len(clean)) % SIZE, list(IN_STEP[loss]))
-    else:
+    here = ~np.isin(np.arange(len(clean)) % SIZE, list(IN_STEP.get(loss, ())))
+    if loss in LOSSES:
         here = generator.present(len(clean), seed + 1000, *LOSSES[loss])
     pipeline = Pipeline(rig(row, block_size=size, **more))
     got = run(pipeline, volts_of(row, clean, seed), truth, here, zero_at=SETTLED if row.offsets else 0)
@@ -396,12 +395,10 @@ def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int =
     clean, truth = optics_of(fine), middles(fine)
     volts = volts_of(Row(kind), clean, seed)
     column = (0, 1, 3, 4)[channel]
-    if kind == 'dead':
-        volts[:, column] = 0.0
-    elif kind == 'stuck':
+    if kind == 'stuck':
         volts[n // 4 :, column] = volts[n // 4, column]
-    elif kind == 'inverted':
-        volts[:, column] *= -1.0
+    elif kind in ('dead', 'inverted'):
+        volts[:, column] = 0.0 if kind == 'dead' else -volts[:, column]
     else:
         pair = [3 * channel, 3 * channel + 1]
         volts[:, pair] = volts[:, pair[::-1]]
@@ -413,10 +410,8 @@ def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int =
     return float(worst), pipeline.estimator.most_likely_wrong()
 
 
-WRONG = tuple(
-    [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
-    + [('swapped', psd) for psd in range(2)]
-)
+WRONG = [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
+WRONG += [('swapped', psd) for psd in range(2)]
 
 
 def one_wrong(rows: int | None) -> int:
@@ -436,7 +431,8 @@ def tones(hz: float, size: float) -> Inside:
     runs = [_shaken(hz, ROWS[0], 16, seed, size) for seed in range(1, 9)]
     later = np.concatenate([run.block for run in runs]) >= 2 * SETTLED
     named = np.array([bool(f) for r in runs for f in r.findings])[later]
-    return inside(*(np.concatenate([getattr(r, n) for r in runs])[later] for n in ('error', 'covariance')), named)
+    error, covariance = (np.concatenate([getattr(r, n) for r in runs])[later] for n in ('error', 'covariance'))
+    return inside(error, covariance, named)
 
 
 Case = tuple[str, str, Callable[..., Inside | Scored], tuple[object, ...], dict[str, object]]

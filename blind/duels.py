@@ -73,8 +73,10 @@ def bent(plant: Plant, y: FloatArray) -> Residual:
         def apart(x: FloatArray) -> FloatArray:
             return y - _vector(plant.simulate(_model(used, x)))
 
-        fitted = least_squares(lambda x: apart(x)[observed], start, bounds=(low, high), x_scale=size)
-        return apart(np.asarray(fitted.x))
+        def subset(x: FloatArray) -> FloatArray:
+            return apart(x)[observed]
+
+        return apart(np.asarray(least_squares(subset, start, bounds=(low, high), x_scale=size).x))
 
     return residual
 

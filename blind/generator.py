@@ -423,13 +423,10 @@ class Generator:
         return output(clean + noise(len(clean), kind, seed) + jitter(clean, effects, seed), effects)
 
 
-LINK = frozenset(
-    (
-        *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
-        *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
-        'tip_force',
-        *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
-        *('law_load', 'law_link'),
-    )
-)
+LINK = {
+    *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+    *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
+    *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
+    *('law_load', 'law_link', 'tip_force'),
+}
 """Effects that change the motion, and with it the slow part of a run."""

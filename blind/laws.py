@@ -20,7 +20,6 @@ from blind.cases import designs, gap_of
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
 
 _BANK = SignatureBank()
@@ -83,9 +82,8 @@ def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
     return [Observation('recording', load_rig(), volts, g.loads, g.temperature)]
 
 
-def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
-    discovery = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
-    return discovery.tree(), discovery
+def answer(law: dict[str, Any] | None, seed: int) -> dict[str, Any]:
+    return discover(observe(law, seed), load_rig(), seed=0, bank=_BANK).tree()
 
 
 def evaluated(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
@@ -145,7 +143,7 @@ def _answer_to_law(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
     law, seed = job
     start = time.perf_counter()
     law = None if law is None else sized(law)
-    return {**evaluated(law, answer(law, seed)[0]), 'number': seed, 'seconds': time.perf_counter() - start}
+    return {**evaluated(law, answer(law, seed)), 'number': seed, 'seconds': time.perf_counter() - start}
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:

@@ -76,8 +76,8 @@ def dots(rig: Mapping[str, float], pose: Array) -> Array:
     tip = np.column_stack((pose[:, :2], np.full(n, LENGTH)))
     out = np.empty((n, 4))
     for i, (fx, fy) in enumerate(generator.PLACES):
-        own = f'psd_{i + 1}.', f'beam_{i + 1}.'
-        channel = {name.partition('.')[2]: v for name, v in rig.items() if name.startswith(own)}
+        mine = f'psd_{i + 1}.', f'beam_{i + 1}.'
+        channel = {name.partition('.')[2]: v for name, v in rig.items() if name.startswith(mine)}
         along = np.array([math.tan(channel['angle_x']), math.tan(channel['angle_y']), 1.0])
         start = np.array([fx + channel['x'], fy + channel['y'], LENGTH + channel['height']])
         origin = tip + rotation @ np.array([channel['center_x'], channel['center_y'], channel['height']])

@@ -16,7 +16,7 @@ from blind.generator import Array, Generator
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.experiment import Limits, proposals
+from psd_deflection.studies.discover.experiment import Limits, Setting, proposals
 from psd_deflection.studies.discover.loop import run_loop
 from psd_deflection.studies.discover.planning import Plan
 
@@ -72,11 +72,13 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
     made: list[Observation] = []
     alternatives: list[list[str]] = []
 
+    def measured(setting: Setting, loads: Array, seed: int, name: str) -> Observation:
+        length = float(str(setting.changes.get('link.length', RIG.link.length)))
+        return observed([hidden], loads, setting.temperature(len(loads)), length, seed, name)
+
     def record(plan: Plan, number: int) -> Observation:
         alternatives.append(sorted({t.alternative for t in plan.discriminations}))
-        length = float(str(plan.setting.changes.get('link.length', RIG.link.length)))
-        warm = plan.setting.temperature(len(plan.loads))
-        made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
+        made.append(measured(plan.setting, plan.loads, seed + number, f'next {number}'))
         return made[-1]
 
     done = run_loop([first], lambda known: discover(known, RIG), record, most=MOST)
@@ -85,15 +87,10 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
     row |= {'outcome': done.outcome, 'recordings': len(done.plans), 'named': named, 'together': together}
     row |= {'left': alternatives, 'planned': [p.words for p in done.plans], 'verdict': done.discovery.verdict}
     row['right'] = named == [name] or (done.outcome != 'unique' and name in (*named, *together))
-    confounded = bool(done.plans) or done.outcome != 'unique'
-    row['kind'] = 'confounded' if confounded else 'alone'
+    row['kind'] = 'confounded' if done.plans or done.outcome != 'unique' else 'alone'
     if done.outcome == 'limits':
-        more = []
-        for i, p in enumerate(proposals(RIG, Limits())):
-            length = float(str(p.setting.changes.get('link.length', RIG.link.length)))
-            script = p.piece.loads(1000.0)
-            warm = p.setting.temperature(len(script))
-            more.append(observed([hidden], script, warm, length, seed + 100 + i, f'all {i}'))
+        every = enumerate(proposals(RIG, Limits()))
+        more = [measured(p.setting, p.piece.loads(1000.0), seed + 100 + i, f'all {i}') for i, p in every]
         best = discover([first, *made, *more], RIG)
         row['separable'] = [e.active.effect.name for e in best.effects] == [name] and not best.unsettled
     row['seconds'] = time.perf_counter() - start

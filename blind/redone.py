@@ -71,6 +71,11 @@ class Curves(NamedTuple):
     poses: Mapping[str, Array]
 
 
+Drawn = Mapping[str, Mapping[str, Curves]]
+Cameras = Mapping[str, Mapping[str, Array]]
+Answers = Mapping[str, Mapping[str, Any]]
+
+
 @dataclass(frozen=True)
 class Plan:
     """How long and how fine. ``rest``, ``held``: s before and with the weight; ``shrink``: of the image."""
@@ -292,7 +297,7 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
     return summary
 
 
-def _summary(made: Bench, link: Sequence[HeldLoad], answers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _summary(made: Bench, link: Sequence[HeldLoad], answers: Answers) -> dict[str, Any]:
     """Largest errors of ``exact`` on the link, as shares of the deflection at 50 N, by rig file and judge."""
     at = [motion(replace(made.plan, rest=0.0, held=5.0), HeldLoad(50.0, side))[-1] for side in (0, 1)]
     across, twist = float(np.hypot(*at[0][:2])), float(abs(at[1][2]))
@@ -310,7 +315,7 @@ def _summary(made: Bench, link: Sequence[HeldLoad], answers: Mapping[str, Mappin
     return {**out, 'holds': all(v <= limit for v in shares['after'].values())}
 
 
-def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: Mapping[str, Mapping[str, Any]]) -> str:
+def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: Answers) -> str:
     scale = {axis: summary['deflection']['twist' if axis == 'theta' else 'across'] for axis in SYMBOLS}
     rows = []
     for words, stem in (('rig file', 'before'), ('calibrated', 'after')):
@@ -334,7 +339,7 @@ def relative_errors(curves: Curves, camera: Mapping[str, Array]) -> dict[str, Ar
     return {method: poses[late].mean(axis=0) / reference - 1.0 for method, poses in curves.poses.items()}
 
 
-def _table_51(name: str, drawn: Mapping[str, Mapping[str, Curves]], cameras: Mapping[str, Mapping[str, Array]]) -> str:
+def _table_51(name: str, drawn: Drawn, cameras: Cameras) -> str:
     methods = ('wls_sidebar', 'wls', 'iterative', 'exact')
     errors = {stem: relative_errors(curves, cameras[name]) for stem, curves in drawn[name].items()}
     rows = []
@@ -358,13 +363,7 @@ def _over_time(words: str, two: Mapping[str, Curves], camera: Mapping[str, Array
     return Chart(f'{words}: camera and methods over time', panels, beside=3)
 
 
-def _body(
-    made: Bench,
-    summary: Mapping[str, Any],
-    drawn: Mapping[str, Mapping[str, Curves]],
-    cameras: Mapping[str, Mapping[str, Array]],
-    answers: Mapping[str, Mapping[str, Any]],
-) -> Iterator[str]:
+def _body(made: Bench, summary: Mapping[str, Any], drawn: Drawn, cameras: Cameras, answers: Answers) -> Iterator[str]:
     largest = f'sidebar_right_{made.plan.forces[0]:.0f}N'
     code = base64.b64encode((made.folder / f'{largest}.png').read_bytes()).decode()
     words = ', '.join(f'{symbol} {100 * summary["shares"]["after"][axis]:.3f} %' for axis, symbol in SYMBOLS.items())
@@ -407,9 +406,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stem, axes in summary['shares'].items():
         words = ', '.join(f'{axis} {100.0 * share:.3f} %' for axis, share in axes.items())
         print(f'{stem:15s} largest error on the link: {words}')
-    answer = 'within' if summary['holds'] else 'BEYOND'
-    text = f'{answer} {100.0 * summary["limit"]:g} % after calibration; see {args.out / "page.html"}'
-    return conclude(text, summary['holds'])
+    limit = f'{"within" if summary["holds"] else "BEYOND"} {100.0 * summary["limit"]:g} %'
+    return conclude(f'{limit} after calibration; see {args.out / "page.html"}', summary['holds'])
 
 
 if __name__ == '__main__':

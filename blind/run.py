@@ -72,13 +72,11 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
 def _answer_case(job: tuple[Case, Path]) -> None:
     case, folder = job
     path = folder / 'answers' / f'{case.key}.json'
-    if path.exists():
-        return
-    truth = json.loads((folder / 'sealed' / path.name).read_text())['truth']
-    start = time.perf_counter()
-    got, _ = answer(case, truth)
-    got['seconds'] = time.perf_counter() - start
-    _write(path, json.dumps(got))
+    if not path.exists():
+        truth = json.loads((folder / 'sealed' / path.name).read_text())['truth']
+        start = time.perf_counter()
+        got, _ = answer(case, truth)
+        _write(path, json.dumps({**got, 'seconds': time.perf_counter() - start}))
 
 
 def _write(path: Path, text: str) -> None:
@@ -90,12 +88,10 @@ def _write(path: Path, text: str) -> None:
 
 def _sealed(given: tuple[Case, Path]) -> None:
     case, path = given
-    if path.exists():
-        return
-    sealed = {'case': dataclasses.asdict(case), 'truth': truth_of(case)}
-    if case.kind == 'hand':
-        sealed['wrong'] = byhand.drawn(case.design).wrong
-    _write(path, json.dumps(sealed, sort_keys=True))
+    if not path.exists():
+        sealed = {'case': dataclasses.asdict(case), 'truth': truth_of(case)}
+        wrong = {'wrong': byhand.drawn(case.design).wrong} if case.kind == 'hand' else {}
+        _write(path, json.dumps(sealed | wrong, sort_keys=True))
 
 
 def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:

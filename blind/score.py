@@ -150,7 +150,7 @@ def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
     sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, wanted, 1.0, True)
     if single:
         size, most = np.mean([len(r.sets[0]) if r.sets else 1 for r in single]), THRESHOLDS['mean_set_size']
-        sheet.check(size <= most, f'mean size of that set: {size:.2f}, wanted <= {most}')
+        sheet.check(bool(size <= most), f'mean size of that set: {size:.2f}, wanted <= {most}')
     apart = [r for r in single if r.separated]
     first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]
     wanted = THRESHOLDS['named_first_where_separated']

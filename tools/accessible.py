@@ -58,13 +58,11 @@ def main() -> int:
     parser.add_argument('site', type=Path)
     parser.add_argument('--in-turn', action='store_true', help='each page in one view only, a quarter of the time')
     args = parser.parse_args()
-    site = args.site
-    pages = sorted(str(p.relative_to(site)) for p in site.rglob('*.html'))
+    pages = sorted(str(p.relative_to(args.site)) for p in args.site.rglob('*.html'))
     if not pages:
-        raise SystemExit(f'{site}: no pages are there')
-
+        raise SystemExit(f'{args.site}: no pages are there')
     failures = 0
-    with tempfile.TemporaryDirectory() as profile, served(site) as address:
+    with tempfile.TemporaryDirectory() as profile, served(args.site) as address:
         driver = open_browser(Path(profile))
         try:
             for number, view in enumerate(views(driver)):

@@ -123,7 +123,6 @@ def main() -> int:
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='where the .rrd go')
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    target = Path()
     for path in args.recordings:
         target = args.out / f'{path.stem}.rrd'
         target.unlink(missing_ok=True)
@@ -131,10 +130,8 @@ def main() -> int:
         subprocess.run([BIN / 'psd-deflection', 'convert', path, '--out', target], check=True)
         seconds = time.monotonic() - began
         subprocess.run([BIN / 'rerun', 'rrd', 'verify', target], check=True, capture_output=True)
-        recording, written = psd_deflection.open(path), Written(target)
-        breaks = check_poses(written, recording)
-        size = target.stat().st_size
-        print(f'  as recorded: poses and bands; {breaks} breaks; {size} bytes, {seconds:.1f} s')
+        breaks = check_poses(Written(target), psd_deflection.open(path))
+        print(f'  as recorded: poses and bands; {breaks} breaks; {target.stat().st_size} bytes, {seconds:.1f} s')
     shot = args.out / 'shot.png'
     if picture([target], shot):
         check_picture(shot)

@@ -21,14 +21,10 @@ PAGE = re.compile(r'http://127\.0\.0\.1:\d+/')
 LONGEST = 3600.0  # s: longer than this nobody waits for a step on a busy machine; an idle one needs a minute or two.
 ENTER, BUILD = ((ROOT / 'packaging/deb' / name).read_text() for name in ('enter.sh', 'build.sh'))
 PIP = 'apt-get install -qq --no-install-recommends python3-venv >/dev/null 2>&1'
-INSTALL = (
-    'cd /root && apt-get install -qq --no-install-recommends ./stand-in*.deb ./ros-jazzy-*.deb '
-    'python3-zstandard python3-aiohttp >/dev/null 2>&1'
-)
-START = (
-    'cd /root && PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3*/site-packages) '
-    'exec /opt/ros/jazzy/bin/psd-deflection monitor'
-)
+OF_APT = './stand-in*.deb ./ros-jazzy-*.deb python3-zstandard python3-aiohttp'
+INSTALL = f'cd /root && apt-get install -qq --no-install-recommends {OF_APT} >/dev/null 2>&1'
+JAZZY = '/opt/ros/jazzy'
+START = f'cd /root && PYTHONPATH=$(echo {JAZZY}/lib/python3*/site-packages) exec {JAZZY}/bin/psd-deflection monitor'
 LEFT = (
     'the tests of the package in its build (nocheck): Debian has no ROS',
     'the node of ROS: its packages are stood in for; the workflow runs it with those of apt',

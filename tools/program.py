@@ -49,18 +49,16 @@ def ros_domain() -> Iterator[int]:
     raise RuntimeError('no ROS domain is free')
 
 
+Words = Sequence[str]
+Env = Mapping[str, str] | None
+
+
 class Program:
     """``command`` in a new session, without input; stdout and stderr are read together. ``terminal``: it writes to a
     terminal; otherwise into a pipe. ``wait_s`` limits each wait."""
 
     def __init__(
-        self,
-        command: Sequence[str],
-        cwd: Path = ROOT,
-        *,
-        terminal: bool = False,
-        env: Mapping[str, str] | None = None,
-        wait_s: float = WAIT_S,
+        self, command: Words, cwd: Path = ROOT, *, terminal: bool = False, env: Env = None, wait_s: float = WAIT_S
     ) -> None:
         self._wait_s = wait_s
         self._fd, theirs = pty.openpty() if terminal else os.pipe()

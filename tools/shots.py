@@ -79,8 +79,7 @@ def drawn(seconds: float) -> Callable[[Any], bool]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
-    args = parser.parse_args()
-    seconds = args.seconds
+    seconds = parser.parse_args().seconds
     with page_of('--demo') as url:
         take(url, 'monitor', DESK, seconds, loaded if seconds > 10.0 else anything)
         take(url, 'monitor_phone', PHONE, 4.0)

@@ -25,8 +25,7 @@ SIZE = (940, 1250)  # Of the picture.
 
 def state(driver: Any) -> str:
     """What the page says of itself: ready, absent, running, done or failed."""
-    value: str | None = driver.execute_script('return document.getElementById("try-form").dataset.state')
-    return value or ''
+    return str(driver.execute_script('return document.getElementById("try-form").dataset.state') or '')
 
 
 def text(driver: Any, name: str) -> str:

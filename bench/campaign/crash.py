@@ -72,8 +72,7 @@ def main() -> int:
     args = parser.parse_args()
     chance = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as name:
-        bags = Path(name) / 'bags'
-        port = str(Path(name) / 'port')
+        bags, port = Path(name) / 'bags', str(Path(name) / 'port')
         rig_process = Program([*PSD_DEFLECTION, 'simulate', '--serve', '--link', port])
         rig_process.until('port: ')
         rotating = {'bag_max_duration': 0.7}

@@ -71,12 +71,7 @@ def _changed(change: Callable[[Line, bytes], bytes | None], seconds: float) -> A
 def _once(change: Callable[[Line, bytes], bytes]) -> Act:
     def act(line: Line, pid: int) -> None:
         first = iter((change,))
-
-        def tamper(line: Line, frame: bytes) -> bytes | None:
-            todo = next(first, None)
-            return todo(line, frame) if todo is not None else None
-
-        _changed(tamper, 0.03)(line, pid)
+        _changed(lambda line, frame: todo(line, frame) if (todo := next(first, None)) else None, 0.03)(line, pid)
 
     return act
 
@@ -188,18 +183,13 @@ def _duplicates(line: Line, pid: int) -> None:
 
 def _swapped(line: Line, pid: int) -> None:
     waiting: list[bytes] = []
-    done: list[bool] = []
 
     def tamper(identity: int, frame: bytes) -> bytes | None:
-        if done:
-            return None
-        if not waiting:
-            waiting.append(frame)
-            return b''
-        done.append(True)
-        with line.lock:
-            line.taken_by_fault.discard(identity)
-        return None
+        waiting.append(frame)
+        if len(waiting) == 2:
+            with line.lock:
+                line.taken_by_fault.discard(identity)
+        return b'' if len(waiting) == 1 else None
 
     _while(0.02, tamper=tamper)(line, pid)
     line.inject(waiting[0] if waiting else b'')

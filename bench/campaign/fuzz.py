@@ -18,6 +18,7 @@ from pathlib import Path
 import zstandard
 
 ROOT = Path(__file__).resolve().parents[2]
+MEMORY = '/dev/shm' if Path('/dev/shm').is_dir() else None
 LIMITS = ['-timeout=60', '-rss_limit_mb=256', '-max_len=65536']
 HANG_S = 1.0
 """More than this in one reading of an input is a hang, in seconds of the processor: libFuzzer's clock runs on while
@@ -78,8 +79,7 @@ def _file_target(suffix: str, *steps: Callable[[Path], object]) -> Target:
     """Writes the input to a file, and reads that by each of ``steps``."""
     from psd_deflection.base.errors import PsdDeflectionError
 
-    folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
-    path = folder / f'input{suffix}'
+    path = Path(tempfile.mkdtemp(dir=MEMORY)) / f'input{suffix}'
 
     def target(content: bytes) -> list[str]:
         path.write_bytes(content)
@@ -181,8 +181,7 @@ class Choices:
         if kind == 3:
             return int.from_bytes(self.take(4), 'little', signed=True) * 10 ** (self.below(2) * self.below(400))
         if kind == 4:
-            (number,) = struct.unpack('<d', self.take(8))
-            return number
+            return float(struct.unpack('<d', self.take(8))[0])
         if kind < 7:
             return self.text() if kind == 5 else 'x' * self.below(3000)
         if kind == 7:
@@ -222,9 +221,7 @@ def hello_target() -> tuple[Target, list[bytes]]:
             except (ValueError, OverflowError):
                 # It does not fit into a frame.
                 continue
-            for frame in frames:
-                if not isinstance(frame, HelloFrame):
-                    continue
+            for frame in (f for f in frames if isinstance(f, HelloFrame)):
                 try:
                     gate.take(frame, 'port', volts=False)
                 except DeviceError as error:
@@ -318,14 +315,13 @@ def yaml_target() -> tuple[Target, list[bytes]]:
             return anchor + '{' + ', '.join(f'{k}: {message(choices, depth + 1, anchors)}' for k in keys) + '}'
         return anchor + tags[choices.below(len(tags))] + json.dumps(choices.value(4))
 
-    folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
+    path = Path(tempfile.mkdtemp(dir=MEMORY)) / 'input.yaml'
 
     @timed()
     def target(content: bytes) -> list[str]:
         text = message(Choices(content), 0, [])
         rejected = []
         for head, read in (('/**: {ros__parameters: ', load_rig), ('rosbag2_bagfile_information: ', read_information)):
-            path = folder / 'input.yaml'
             path.write_text(head + text + ('}' if head.startswith('/') else ''), errors='replace')
             try:
                 read(path)
@@ -398,8 +394,8 @@ def everything(words: list[str]) -> int:
     runs.append(['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)])
     runs += [['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS]
     for module, *arguments in runs:
-        status = subprocess.run([sys.executable, '-m', f'bench.campaign.{module}', *arguments], check=False).returncode
-        if status:
+        command = [sys.executable, '-m', f'bench.campaign.{module}', *arguments]
+        if status := subprocess.run(command, check=False).returncode:
             return status
     return 0
 

@@ -42,10 +42,6 @@ def faithful(message: Any) -> bool:
     return True
 
 
-def silent(message: Any) -> bool:
-    return False
-
-
 def wrong(field: str, *values: Any, added: bool = False) -> Notify:
     """``field``, or each of its parts x, y, z, w, has another value, or ``added`` to what it had."""
 
@@ -82,7 +78,7 @@ DEFLECTIONS: dict[str, tuple[Notify, str]] = {
     'not finite': (wrong(f'{PLACE}.x', math.nan), 'not finite'),
     'jump': (wrong(f'{PLACE}.x', 0.1, added=True), 'jumps by'),
     'stale': (by_seconds(-1.0), 'is older than'),
-    'silent': (silent, 'no deflection for'),
+    'silent': (lambda message: False, 'no deflection for'),
     '1e300': (wrong(f'{PLACE}.z', 1e300), 'more than the links can have'),
     'ten metres': (wrong(f'{PLACE}.z', 10.0), 'more than the links can have'),
     'denormal quaternion': (wrong('pose.pose.orientation', 0.0, 0.0, 0.0, 1e-200), 'no deflection for'),

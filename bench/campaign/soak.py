@@ -34,11 +34,10 @@ START_S = 300.0
 SETTLED_S = 180
 ALLOWED_STD_NS = 50_000
 ALLOWED_GROWTH = 2_000_000
-PAGE = os.sysconf('SC_PAGE_SIZE')
 
 
 def resident(pid: int) -> int:
-    return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * PAGE
+    return int(Path(f'/proc/{pid}/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE')
 
 
 class PolledDevice:

@@ -74,8 +74,7 @@ class Stranger:
             return usual + self.chance.gauss(0.0, 0.02)
         if kind < 0.9:
             return self.chance.choice(NUMBERS)
-        (out,) = struct.unpack('<d', self.chance.randbytes(8))
-        return float(out)
+        return float(struct.unpack('<d', self.chance.randbytes(8))[0])
 
     def _stamp(self, value: Any) -> Any:
         chance = self.chance
