@@ -209,18 +209,10 @@ STEPS = 8
 Planning and further searches go on at its end."""
 
 FIELDS = (
-    ERROR,
-    Field('verdict', str),
-    Field('effects', str),
-    Field('unknown', int),
-    Field('setup', str),
-    Field('gap_before', float, 'm'),
-    Field('gap_after', float, 'm'),
-    Field('gap_floor', float, 'm'),
-    Field('heldout_before', float, 'm'),
-    Field('heldout_after', float, 'm'),
-    Field('simulations', int),
-    Field('result', str),
+    *(ERROR, Field('verdict', str), Field('effects', str), Field('unknown', int), Field('setup', str)),
+    *(Field(f'gap_{name}', float, 'm') for name in ('before', 'after', 'floor')),
+    *(Field(f'heldout_{name}', float, 'm') for name in ('before', 'after')),
+    *(Field('simulations', int), Field('result', str)),
 )
 """Columns of --each. ``result`` is the content of result.json."""
 
