@@ -16,7 +16,6 @@ from psd_deflection.records import DeflectionEstimate, FloatArray, RawChunk
 from psd_deflection.rig.config import Rig, load_rig
 
 SETTLED_S = 10.0  # Time after the load step when the modes have decayed.
-
 CASES = {'unloaded': (0.0, 0.0, 0.0)}
 CASES |= {f'{f:g} N on the sidebar': sidebar(f) for f in (10.0, 30.0, 50.0)}
 CASES |= {f'{f:g} N on the link': direct(f) for f in (10.0, 30.0, 50.0)}
@@ -37,10 +36,9 @@ def errors(rig: Rig, load: tuple[float, float, float], blocks: int) -> tuple[Flo
     rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
     skipped = round(SETTLED_S * rate / size) * size
     simulated = RigSimulator(rig, seed=1).step(constant(load, (skipped + blocks * size) / rate, rate).loads)
-    counts, pose = simulated.counts[skipped:], simulated.pose[skipped:]
+    counts, pose, pipeline = simulated.counts[skipped:], simulated.pose[skipped:], Pipeline(rig)
     seq = np.arange(len(counts))
     t_ns = np.rint(seq * 1e9 / rate).astype(np.int64)
-    pipeline = Pipeline(rig)
     chunk = RawChunk(seq, t_ns, counts, np.zeros(len(seq), np.uint8), rig.converter.volts_per_count)
     records = [*pipeline.process(chunk), *pipeline.flush()]
     estimates = np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])

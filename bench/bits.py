@@ -2,24 +2,97 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bits of a recording on other processors: ``make bits``; three minutes on two cores."""
 
+from __future__ import annotations
+
 import argparse
 import concurrent.futures
 import hashlib
+import importlib.metadata
+import itertools
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from bench import aarch64
+if TYPE_CHECKING:
+    from psd_deflection.recordings.recording import Recording
+    from psd_deflection.records import Record
+    from psd_deflection.rig.config import Rig
 
 ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / 'bags'
 NAMES = ('clean', 'lost_samples', 'laser_off', 'motion', 'calibrated', 'three_psds')
 KERNELS = {'Haswell': 'avx2', 'SkylakeX': 'avx512f', 'Zen': 'avx2', 'Nehalem': 'sse4_2'}
 """Kernels of OpenBLAS, each with the instructions that it needs, as /proc/cpuinfo names them."""
+FOLDER = ROOT / 'build' / 'aarch64'  # A Python for aarch64 with our versions of the libraries, for qemu to run.
+LIBRARIES = ('numpy', 'scipy', 'zstandard', 'PyYAML', 'ruamel.yaml', 'tqdm', 'pyserial')
+PLATFORMS = tuple(f'--platform=manylinux_2_{glibc}_aarch64' for glibc in (28, 27, 17))
+
+
+class BuildError(Exception):
+    """This machine cannot get the packages; the message says which command failed."""
+
+
+def emulated_python() -> tuple[list[str], dict[str, str]]:
+    """Command and environment of the interpreter; the first call downloads 100 MB by apt-get and pip.
+
+    Raises BuildError."""
+    done = FOLDER / 'done'
+    wanted = '\n'.join(f'{name}=={importlib.metadata.version(name)}' for name in LIBRARIES)
+    if not done.exists() or done.read_text(encoding='utf-8') != wanted:
+        shutil.rmtree(FOLDER, ignore_errors=True)
+        _unpack_debian('arm64', FOLDER / 'root', 'python3-minimal', 'libpython3-stdlib', 'libstdc++6')
+        _unpack_debian('', FOLDER / 'qemu', 'qemu-user-static')
+        version = _interpreter().name.removeprefix('python')
+        uv = shutil.which('uv')
+        by_uv = [str(uv), 'pip', 'install', '--python-platform', 'aarch64-manylinux_2_28']
+        install = by_uv if uv else [sys.executable, '-m', 'pip', 'install', *PLATFORMS]
+        words = ['--target', str(FOLDER / 'site'), '--only-binary=:all:', '--python-version', version]
+        _done([*install, *words, *wanted.split()])
+        done.write_text(wanted, encoding='utf-8')
+    qemu = FOLDER / 'qemu/usr/bin/qemu-aarch64-static'
+    return [str(qemu), '-L', str(FOLDER / 'root'), str(_interpreter())], {'PYTHONPATH': str(FOLDER / 'site')}
+
+
+def _interpreter() -> Path:
+    return (FOLDER / 'root/usr/bin/python3').resolve()
+
+
+def _unpack_debian(architecture: str, folder: Path, *packages: str) -> None:
+    """Unpack packages and what they depend on, of this system's mirrors, without installing them.
+
+    ``architecture``: '' for this machine's, of which the packages alone are unpacked."""
+    state = folder.with_suffix('.apt')
+    for each in ('lists/partial', 'archives/partial'):
+        (state / each).mkdir(parents=True)
+    folder.mkdir(parents=True)
+    options = [f'Dir::State={state}', f'Dir::Cache={state}', 'Dir::State::status=/dev/null', 'APT::Sandbox::User=root']
+    if architecture:
+        options += [f'APT::Architecture={architecture}', f'APT::Architectures::={architecture}']
+    get = ['apt-get', '-qq', *(word for option in options for word in ('-o', option))]
+    _done([*get, 'update'])
+    if architecture:
+        _done([*get, 'install', '--download-only', '--yes', '--no-install-recommends', *packages])
+    else:
+        _done([*get, 'download', *packages], state / 'archives')
+    for archive in sorted((state / 'archives').glob('*.deb')):
+        _done(['dpkg', '-x', str(archive), str(folder)])
+    shutil.rmtree(state)
+
+
+def _done(command: list[str], folder: Path | None = None) -> None:
+    environment = {**os.environ, 'DEBIAN_FRONTEND': 'noninteractive'}
+    try:
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    except FileNotFoundError as error:
+        raise BuildError(f'no {command[0]}') from error
+    if done.returncode:
+        raise BuildError(f'{command[0]} {command[-1]}: {done.stderr.strip().splitlines()[-1:]}')
 
 
 Setting = tuple[list[str], dict[str, str]]
@@ -37,8 +110,8 @@ def settings() -> tuple[dict[str, Setting], list[str]]:
         out['libc without FMA'] = ours, {'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F'}
     excluded = [f'{kernel}: not of this processor' for kernel in KERNELS if kernel not in there]
     try:
-        out['aarch64, in qemu'] = aarch64.python()
-    except aarch64.BuildError as error:
+        out['aarch64, in qemu'] = emulated_python()
+    except BuildError as error:
         excluded.append(f'aarch64: {error}')
     return out, excluded
 
@@ -67,33 +140,36 @@ def of_setting(setting: Setting, *words: str) -> str:
     return done.stdout
 
 
-def record(folder: Path) -> None:
-    """The golden recordings' samples through the pipeline of this process, recorded in ``folder``."""
+def again(folder: Path) -> Iterator[tuple[str, Recording, Rig, Iterator[list[Record]]]]:
+    """The recordings of a folder by name, and what the pipeline of this process makes of each."""
     from psd_deflection.measure.pipeline import Pipeline
     from psd_deflection.recordings.replay.engine import open_for_replay, replayed
-    from psd_deflection.recordings.write.sinks import open_sink
 
     for name in NAMES:
-        recording, rig = open_for_replay(str(BAGS / name), None, None)
+        recording, rig = open_for_replay(str(folder / name), None, None)
+        yield name, recording, rig, replayed(recording, Pipeline(rig), None)
+
+
+def record(folder: Path) -> None:
+    """The golden recordings' samples through the pipeline of this process, recorded in ``folder``."""
+    from psd_deflection.recordings.formats.format import open_sink
+
+    for name, recording, rig, replay in again(BAGS):
         sink = open_sink(str(folder / name), rig.flat(), device_hello=recording.hello)
-        for records in replayed(recording, Pipeline(rig), None):
-            for output in records:
-                sink.put(output)
+        for output in itertools.chain.from_iterable(replay):
+            sink.put(output)
         sink.close()
 
 
 def compare(folders: Sequence[str]) -> None:
     """Print the messages that differ, of each of ``folders``, if this process replays what is in it."""
-    from psd_deflection.measure.pipeline import Pipeline
     from psd_deflection.recordings.replay.comparison import ReplayComparison
-    from psd_deflection.recordings.replay.engine import open_for_replay, replayed
 
     for folder in folders:
         differ = equal = 0
-        for name in NAMES:
-            recording, rig = open_for_replay(str(Path(folder) / name), None, None)
+        for _, recording, _, replay in again(Path(folder)):
             comparison = ReplayComparison(recording)
-            for records in replayed(recording, Pipeline(rig), None):
+            for records in replay:
                 comparison.add(records)
             comparison.finish()
             differ += comparison.different + comparison.only_recorded + comparison.only_replayed
@@ -137,12 +213,9 @@ def table(jobs: int, folder: Path) -> bool:
         total += sum(counts)
         print(f'{name:<{wide}}  ' + ' '.join(f'{count:>5}' for count in counts))
     equal = differing[0][kinds[next(iter(every))]][1]
-    print(
-        f'{len(every)} settings, {equal} messages each ({", ".join(NAMES)}): '
-        + ('no bit differs' if not total else f'{total} differ')
-    )
-    for each in excluded:
-        print(f'not tried: {each}')
+    words = 'no bit differs' if not total else f'{total} differ'
+    print(f'{len(every)} settings, {equal} messages each ({", ".join(NAMES)}): {words}')
+    print(*(f'not tried: {each}\n' for each in excluded), sep='', end='')
     return total == 0
 
 
@@ -152,11 +225,8 @@ def main() -> int:
     parser.add_argument('--record', type=Path, metavar='FOLDER', help=argparse.SUPPRESS)
     parser.add_argument('--compare', nargs='+', metavar='FOLDER', help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.record is not None:
-        record(args.record)
-        return 0
-    if args.compare is not None:
-        compare(args.compare)
+    if args.record or args.compare:
+        record(args.record) if args.record else compare(args.compare)
         return 0
     with tempfile.TemporaryDirectory() as folder:
         return 0 if table(args.jobs, Path(folder)) else 1

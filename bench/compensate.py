@@ -27,12 +27,10 @@ URDF = ROOT / 'config' / 'two_links.urdf'
 PERIOD = 0.02
 LATE = 0.03
 NOISE = 1e-6  # Of a deflection, m, one standard deviation.
-
 PAYLOAD = np.array([0.0, 0.0, -20.0])
 TAKEN, MOVED, ARRIVED, LOST, BACK, ENABLED, PUT_DOWN, END = 1.0, 8.0, 11.0, 16.0, 16.5, 3.0, 20.0, 26.0
 TONES: tuple[Colour, ...] = ('blue', 'orange')
 POSES = np.array([[1.2, 0.6], [0.7, 1.3]])
-
 WINDOWS = {
     'payload held': (ENABLED + 3.0, MOVED),
     'while the arm moves': (MOVED, ARRIVED),
@@ -97,14 +95,10 @@ def rms(ran: Ran, window: tuple[float, float]) -> float:
 def chart(without: Ran, ran: Ran) -> Chart:
     events = ((TAKEN, 'payload'), (ENABLED, 'enabled'), (MOVED, 'move'), (LOST, 'no estimates'), (PUT_DOWN, 'put down'))
     rules = [Rule(t, what) for t, what in events]
-    errors = (
-        Series('without', without.t, without.error * 1e3, 'quiet'),
-        Series('with', ran.t, ran.error * 1e3, 'blue'),
-    )
-    joints = [
-        Series(name, ran.t, column * 1e3, tone)
-        for name, tone, column in zip(('shoulder', 'elbow'), TONES, ran.offsets.T, strict=True)
-    ]
+    both: tuple[tuple[str, Ran, Colour], ...] = (('without', without, 'quiet'), ('with', ran, 'blue'))
+    errors = [Series(name, each.t, each.error * 1e3, tone) for name, each, tone in both]
+    named = zip(('shoulder', 'elbow'), TONES, ran.offsets.T, strict=True)
+    joints = [Series(name, ran.t, column * 1e3, tone) for name, tone, column in named]
     held = ran.held > 0
     joints.append(Series('held', np.tile(ran.t[held], 2), ran.offsets[held].T.ravel() * 1e3, 'red', 'points'))
     panels = (

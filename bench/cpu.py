@@ -26,7 +26,6 @@ RESULTS = ROOT / 'bench' / 'cpu.json'
 SETTLE_BLOCKS = 250  # Five seconds of blocks: what is imported and made at the start is over.
 PATIENCE_S = 300.0  # Longest time until the node runs, s.
 ENOUGH = 0.98  # Least share of the blocks that a node gets through which is not held up by others.
-
 PARTS: dict[str, list[str]] = tomllib.loads((ROOT / 'bench' / 'cpu_parts.toml').read_text(encoding='utf-8'))
 COLLECTION = 'garbage collection'
 REST = 'rest: waking up, waiting, loops'
@@ -98,12 +97,9 @@ class Clocks:
             used = int((task / 'schedstat').read_text().split()[0])
             number = int(task.name)
             name = names.get(number) or (task / 'comm').read_text().strip()
-            out[task.name] = {
-                'name': re.sub(r'[.0-9]+$|_?\d+$', '', name) or name,
-                'used': used,
-                'spent': dict(self.spent[number]),
-                'calls': sum(self.calls[number].values()),
-            }
+            shown = re.sub(r'[.0-9]+$|_?\d+$', '', name) or name
+            spent, calls = dict(self.spent[number]), sum(self.calls[number].values())
+            out[task.name] = {'name': shown, 'used': used, 'spent': spent, 'calls': calls}
         return out
 
 
@@ -155,9 +151,7 @@ def parts(reported: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float
 
 
 def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]:
-    device = Device()
-    device.thread.start()
-    with tempfile.TemporaryDirectory() as folder:
+    with Device() as device, tempfile.TemporaryDirectory() as folder:
         words = ['--node', device.port.name, '--folder', folder, '--seconds', f'{seconds:g}']
         child = piped('bench.cpu', *words)
         timer = threading.Timer(PATIENCE_S + seconds, child.kill)
@@ -171,15 +165,10 @@ def measure(seconds: float) -> tuple[dict[tuple[str, str], float], float, float]
             timer.cancel()
             child.send_signal(signal.SIGTERM)
             child.wait(60.0)
-            device.stop.set()
-            device.thread.join()
     reported = json.loads(line)
     if reported['blocks'] < ENOUGH * BLOCKS_PER_S * reported['took']:
-        print(
-            f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors, '
-            f'and the parts of the threads that wait for them come out too small',
-            file=sys.stderr,
-        )
+        slow = f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors'
+        print(f'{slow}, and the parts of the threads that wait for them come out too small', file=sys.stderr)
     return parts(reported)
 
 
@@ -208,7 +197,7 @@ def main() -> int:
         return node(args.node, args.folder, args.seconds)
     row = row_of(*measure(args.seconds))
     args.results.unlink(missing_ok=True)
-    keep([row], args.results)
+    keep([row], args.results, notified=False)
     return conclude('\n'.join([row.work, *(f'  {f.median:5.1f} %  {f.name}' for f in row.figures)]))
 
 

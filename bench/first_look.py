@@ -41,7 +41,6 @@ def look(browser: webdriver.Chrome, folder: str) -> tuple[float, float, float, s
         served = time.monotonic() - began
         before = busy_s(browser)
         browser.get(url)
-
         wait = WebDriverWait(browser, LIMIT_S, poll_frequency=0.01)
         wait.until(lambda b: b.execute_script(DRAWN), 'no trace')
         busy = busy_s(browser) - before

@@ -12,7 +12,7 @@ import tempfile
 import time
 import unittest.mock
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -27,7 +27,7 @@ from mcap_ros2.writer import Writer
 from scipy.signal import lsim
 
 from bench.live import make_recording
-from bench.rows import BY_HAND, ROOT, Row, figure, in_turns, keep, notify
+from bench.rows import BY_HAND, ROOT, Row, figure, in_turns, keep
 from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.devices.protocol.frames import FrameDecoder, SampleFrame, encode
 from psd_deflection.measure.pipeline import Pipeline
@@ -45,7 +45,6 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.discover.discover import discover
 
 READ_FRAMES = 18  # Frames of one read: the reader waits until a block is nearly whole.
-
 TEN = (
     *('clamp_bending_compliance,compliance=1e-4', 'damping,bending_ratio=0.02', 'creep,amplitude=0.03'),
     *('load_direction,angle=0.01', 'sensor_position,psd=1,x=1e-3', 'sensor_rotation,psd=2,angle=0.01'),
@@ -85,19 +84,13 @@ def frames(times: int) -> list[Row]:
 
     if ours(pieces) != len(counts) or peer(pieces) != len(counts):
         raise SystemExit('frames were lost')
-    per_frame = 1e6 / len(counts)
-    return [
-        in_turns(
-            f'frame decoding, {what}',
-            'us a frame',
-            per_frame,
-            times,
-            ('FrameDecoder', 'ours', partial(ours, received), None),
-            ('cobs + struct, frame by frame', 'peer', partial(peer, received), bound),
-            ('split and crc32 of the same bytes', 'limit', partial(limit, received), None),
-        )
-        for what, received, bound in (('in pieces as they are read', pieces, 1.0), ('at once', [stream], 5.0))
-    ]
+    rows = []
+    for what, received, bound in (('in pieces as they are read', pieces, 1.0), ('at once', [stream], 5.0)):
+        decoder = ('FrameDecoder', 'ours', partial(ours, received), None)
+        beside = ('cobs + struct, frame by frame', 'peer', partial(peer, received), bound)
+        least = ('split and crc32 of the same bytes', 'limit', partial(limit, received), None)
+        rows.append(in_turns(f'frame decoding, {what}', 'us a frame', 1e6 / len(counts), times, decoder, beside, least))
+    return rows
 
 
 def replay(times: int, minutes: float) -> list[Row]:
@@ -107,36 +100,32 @@ def replay(times: int, minutes: float) -> list[Row]:
         rig = rig_at_start(open_recording(path))
 
         def ours() -> None:
-            recording = open_recording(path)
             pipeline = Pipeline(rig)
-            for _records in replayed(recording, pipeline):
+            for _records in replayed(open_recording(path), pipeline):
                 pass
             if pipeline.counters.samples != n:
                 raise SystemExit(f'replay saw {pipeline.counters.samples} of {n} samples')
 
         def by_mcap_ros2() -> None:
             pipeline = Pipeline(rig)
-            with file.open('rb') as stream:
-                messages = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
-                for _, _, _, message in messages:
-                    _process(pipeline, message)
+            for message in _decoded(file):
+                _process(pipeline, message)
 
         def limit() -> None:
             with file.open('rb') as stream:
                 for _message in make_reader(stream).iter_messages():
                     pass
 
-        return [
-            in_turns(
-                f'replay of {minutes:g} minutes to estimates, all solvers',
-                's',
-                1.0,
-                times,
-                ('psd_deflection replay', 'ours', ours, None),
-                ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0),
-                ('bare mcap iteration of the file', 'limit', limit, 1.3),
-            )
-        ]
+        peer = ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0)
+        bare = ('bare mcap iteration of the file', 'limit', limit, 1.3)
+        work = f'replay of {minutes:g} minutes to estimates, all solvers'
+        return [in_turns(work, 's', 1.0, times, ('psd_deflection replay', 'ours', ours, None), peer, bare)]
+
+
+def _decoded(file: Path) -> Iterator[Any]:
+    with file.open('rb') as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        yield from (message for _, _, _, message in reader.iter_decoded_messages([SAMPLES]))
 
 
 def _process(pipeline: Pipeline, message: Any) -> None:
@@ -154,12 +143,8 @@ _DTYPES = {2: 'u1', 5: '<i4', 6: '<u4', 7: '<f4', 8: '<f8'}
 
 
 def _points(message: Any) -> npt.NDArray[np.void]:
-    layout = {
-        'names': [f.name for f in message.fields],
-        'formats': [_DTYPES[f.datatype] for f in message.fields],
-        'offsets': [f.offset for f in message.fields],
-        'itemsize': message.point_step,
-    }
+    names, formats, offsets = zip(*((f.name, _DTYPES[f.datatype], f.offset) for f in message.fields), strict=True)
+    layout = {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': message.point_step}
     points: npt.NDArray[np.void] = np.frombuffer(bytes(message.data), np.dtype(cast(Any, layout)))
     return points
 
@@ -190,6 +175,11 @@ def conversion(times: int, minutes: float) -> list[Row]:
         def pandas_to_mcap() -> None:
             frame = pandas.read_csv(table, dtype=dict.fromkeys(CHANNELS, np.float32))
             points = np.zeros(len(frame), [('seq', '<u4'), *((c, '<f4') for c in CHANNELS)])
+            fields = [
+                {'name': f, 'offset': of, 'datatype': 6 if f == 'seq' else 7, 'count': 1}
+                for f, (_, of, *_) in (points.dtype.fields or {}).items()
+            ]
+            size, same = points.dtype.itemsize, {'is_bigendian': False, 'is_dense': True, 'fields': fields}
             points['seq'] = np.arange(len(frame))
             for channel in CHANNELS:
                 points[channel] = frame[channel]
@@ -201,59 +191,29 @@ def conversion(times: int, minutes: float) -> list[Row]:
                     block = points[first : first + 20]
                     at = int(t_ns[first])
                     header = {'stamp': {'sec': at // 10**9, 'nanosec': at % 10**9}, 'frame_id': 'psd'}
-                    message = {
-                        'header': header,
-                        'height': 1,
-                        'width': len(block),
-                        'fields': [
-                            {'name': f, 'offset': of, 'datatype': 6 if f == 'seq' else 7, 'count': 1}
-                            for f, (_, of, *_) in (points.dtype.fields or {}).items()
-                        ],
-                        'is_bigendian': False,
-                        'point_step': points.dtype.itemsize,
-                        'row_step': block.nbytes,
-                        'data': block.tobytes(),
-                        'is_dense': True,
-                    }
+                    shape = {'height': 1, 'width': len(block), 'point_step': size, 'row_step': block.nbytes}
+                    message = {'header': header, **shape, **same, 'data': block.tobytes()}
                     writer.write_message(SAMPLES, schema, message, at, at)
                 writer.finish()
 
         def mcap_to_pandas() -> None:
-            parts = []
-            with bag.open('rb') as stream:
-                messages = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages([SAMPLES])
-                for _, _, _, message in messages:
-                    parts.append(_points(message))
-            points = np.concatenate(parts)
+            points = np.concatenate([_points(message) for message in _decoded(bag)])
             frame = pandas.DataFrame({c: points[c] for c in CHANNELS})
             frame.insert(0, 't', np.arange(len(frame)) / 1000)
             frame.to_csv(new('.csv'), index=False)
 
-        def copied(source: Path) -> Callable[[], None]:
-            def copy() -> None:
-                new('.copy').write_bytes(source.read_bytes())
+        def copy() -> None:
+            new('.copy').write_bytes(table.read_bytes())
 
-            return copy
+        def row(way: str, source: Path, ending: str, by_hand: str, peer: Callable[[], None]) -> Row:
+            ours_too = ('psd_deflection convert', 'ours', lambda: ours(source, new(ending)), None)
+            limit = ('reading and writing the bytes of the CSV', 'limit', copy, None)
+            work = f'{way}, {minutes:g} minutes of samples'
+            return in_turns(work, 's', 1.0, times, ours_too, (f'{by_hand} by hand', 'peer', peer, 1.0), limit)
 
         return [
-            in_turns(
-                f'CSV to bag, {minutes:g} minutes of samples',
-                's',
-                1.0,
-                times,
-                ('psd_deflection convert', 'ours', lambda: ours(table, new('.mcap')), None),
-                ('pandas and mcap-ros2-support by hand', 'peer', pandas_to_mcap, 1.0),
-                ('reading and writing the bytes of the CSV', 'limit', copied(table), None),
-            ),
-            in_turns(
-                f'bag to CSV, {minutes:g} minutes of samples',
-                's',
-                1.0,
-                times,
-                ('psd_deflection convert', 'ours', lambda: ours(bag, new('.csv')), None),
-                ('mcap-ros2-support and pandas by hand', 'peer', mcap_to_pandas, 1.0),
-                ('reading and writing the bytes of the CSV', 'limit', copied(table), None),
-            ),
+            row('CSV to bag', table, '.mcap', 'pandas and mcap-ros2-support', pandas_to_mcap),
+            row('bag to CSV', bag, '.csv', 'mcap-ros2-support and pandas', mcap_to_pandas),
         ]
 
 
@@ -265,17 +225,11 @@ def simulation(times: int) -> list[Row]:
     model = ForwardModel(rig)
     physics = model.physics
     t = np.arange(len(loads)) * physics.period
-    modes = [
-        (2.0 * np.pi * f, z)
-        for f, z in (
-            (physics.bending_frequency, physics.bending_damping_ratio),
-            (physics.bending_frequency, physics.bending_damping_ratio),
-            (physics.torsion_frequency, physics.torsion_damping_ratio),
-        )
-    ]
+    bending = 2.0 * np.pi * physics.bending_frequency, physics.bending_damping_ratio
+    torsion = 2.0 * np.pi * physics.torsion_frequency, physics.torsion_damping_ratio
 
     def peer() -> None:
-        for axis, (w, z) in enumerate(modes):
+        for axis, (w, z) in enumerate((bending, bending, torsion)):
             lsim(([w * w], [1.0, 2.0 * z * w, w * w]), loads[:, axis], t, interp=False)
 
     arrays: list[FloatArray] = [np.zeros((3, len(t))), np.zeros((4, len(t))), np.zeros((6, len(t)))]
@@ -284,30 +238,19 @@ def simulation(times: int) -> list[Row]:
         for array in arrays:
             np.multiply(array, 1.0001)
 
-    return [
-        in_turns(
-            'forward simulation, 60 s, ten effects',
-            'ms',
-            1e3,
-            times,
-            ('ForwardModel', 'ours', lambda: ForwardModel(rig).run(loads), None),
-            ('scipy lsim of its three modes alone', 'peer', peer, 20.0),
-            ('one pass of numpy over pose, dots and volts', 'limit', limit, None),
-        )
-    ]
+    beside = ('scipy lsim of its three modes alone', 'peer', peer, 20.0)
+    least = ('one pass of numpy over pose, dots and volts', 'limit', limit, None)
+    ours = ('ForwardModel', 'ours', lambda: ForwardModel(rig).run(loads), None)
+    return [in_turns('forward simulation, 60 s, ten effects', 'ms', 1e3, times, ours, beside, least)]
 
 
+FOUR = (
+    *('sensor_rotation,psd=2,angle=0.01', 'load_direction,angle=0.004', 'amplifier_lag,time_constant=0.0005'),
+    'bending_stiffness,scale=-0.013',
+)
 SEARCHES: tuple[tuple[str, tuple[str, ...], tuple[str, ...], float | None], ...] = (
-    ('one effect', ('sensor_rotation,psd=2,angle=0.01',), (), 1.3),
-    (
-        'four effects',
-        (
-            *('sensor_rotation,psd=2,angle=0.01', 'load_direction,angle=0.004', 'amplifier_lag,time_constant=0.0005'),
-            'bending_stiffness,scale=-0.013',
-        ),
-        (),
-        None,
-    ),
+    ('one effect', FOUR[:1], (), 1.3),
+    ('four effects', FOUR, (), None),
     ('an unknown effect', ('sensor_nonlinearity,psd=1,k=300',), ('sensor_nonlinearity',), None),
 )
 """What is missing, how it is simulated, what the library lacks, and the bound to its forward simulations."""
@@ -385,9 +328,8 @@ def verdicts(times: int) -> list[Row]:
             loads = ['--loads', 'identification'] * repeats
             used_by('simulate', '--out', table, *loads, '--effect', SEARCHES[0][1][0], '--seed', '5')
             lasts = len(load_history('identification', 1000.0).loads) * repeats / 1000.0
-            seconds, memory = zip(
-                *(used_by('discover', table, '--out', f'{folder}/found') for _ in range(times)), strict=True
-            )
+            runs = [used_by('discover', table, '--out', f'{folder}/found') for _ in range(times)]
+            seconds, memory = zip(*runs, strict=True)
             work, name = f'discover, {lasts:g} s in a CSV, one effect', 'psd-deflection discover'
             limit = figure('what its recording lasts', 'limit', [lasts], 1.0)
             rows.append(Row(f'{work}: from start to report', 's', [figure(name, 'ours', seconds), limit]))
@@ -413,10 +355,7 @@ def main() -> int:
     }
     for name, job in jobs.items():
         if args.only in (None, name):
-            rows = job()
-            for row in rows:
-                notify(row)
-            keep(rows, args.results)
+            keep(job(), args.results)
     return 0
 
 

@@ -4,6 +4,7 @@
 
 import argparse
 import asyncio
+import contextlib
 import itertools
 import json
 import os
@@ -15,11 +16,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.rows import BY_HAND, ROOT, Row, figure, keep, notify, piped
+from bench.rows import BY_HAND, ROOT, Row, figure, keep, piped
 
 BLOCKS_PER_S = 50
 START_S = 4.0  # A process has imported rclpy and found the others.
@@ -168,9 +170,8 @@ def bare_writer(recording: str, seconds: float) -> None:
             now = time.time_ns()
             for topic, kind, data in next(blocks):
                 if topic not in channels:
-                    channels[topic] = writer.register_channel(
-                        topic, 'cdr', writer.register_schema(kind, 'ros2msg', b'')
-                    )
+                    schema = writer.register_schema(kind, 'ros2msg', b'')
+                    channels[topic] = writer.register_channel(topic, 'cdr', schema)
                 writer.add_message(channels[topic], now, data, now)
 
         notify_share(seconds, step)
@@ -180,21 +181,11 @@ def parts(seconds: float, times: int) -> list[float]:
     """Reading the port, publishing and writing the same messages, each alone: the sum of their CPU, % of a core."""
     sums = []
     with tempfile.TemporaryDirectory() as folder:
-        recording, _ = make_recording(Path(folder), 0.1)
+        recording = str(make_recording(Path(folder), 0.1)[0])
         for _ in range(times):
-            device = Device()
-            device.thread.start()
-            total = 0.0
-            for role, what in (
-                ('reader', device.port.name),
-                ('publishers', str(recording)),
-                ('writer', str(recording)),
-            ):
-                message, _ = child(role, what, seconds).communicate()
-                total += float(message)
-            sums.append(total)
-            device.stop.set()
-            device.thread.join()
+            with Device() as device:
+                each = (('reader', device.port.name), ('publishers', recording), ('writer', recording))
+                sums.append(sum(float(child(role, what, seconds).communicate()[0]) for role, what in each))
     return sums
 
 
@@ -211,7 +202,15 @@ class Device:
         self.device = SimulatedFrames(RigFeed(load_rig(), lambda _, n: np.zeros((n, 3))))
         self.written: list[int] = []
         self.stop = threading.Event()
-        self.thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        self._thread.join()
 
     def _run(self) -> None:
         start = time.monotonic_ns()
@@ -251,32 +250,43 @@ class Latencies:
     shares: list[float] = field(default_factory=list)
 
 
-def begin(port: str, *options: str, page: bool = False) -> subprocess.Popen[str]:
-    """Start the node on ``port``; ``page``: it serves the live page too, on a port that is free."""
+@contextlib.contextmanager
+def node(port: str, *options: str, page: bool = False) -> Iterator[tuple[int, str]]:
+    """The node on ``port``: its process, and its address if it serves the live ``page`` too, on a port that is free."""
     more = ['--monitor', '--ros-args', '-p', 'monitor_port:=0'] if page else []
     command = [sys.executable, '-m', 'psd_deflection', 'estimator', '--port', port, *options, *more]
-    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    url = next(line.split()[1] for line in process.stderr if line.startswith('monitor: ')) if page else ''
+    # Its further output is read and ignored.
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    try:
+        yield process.pid, url
+    finally:
+        process.terminate()
+        process.wait(60.0)
+
+
+def until_ready(*children: subprocess.Popen[str]) -> None:
+    for process in children:
+        assert process.stdout is not None
+        process.stdout.readline()
 
 
 def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
     """One node, recording; ``page``: it serves the live page too, and a browser's worth of it is fetched."""
-    device = Device()
-    device.thread.start()
-    with tempfile.TemporaryDirectory() as folder:
-        node = begin(device.port.name, '--record', folder, page=page)
-        assert node.stderr is not None
-        url = next(line.split()[1] for line in node.stderr if line.startswith('monitor: ')) if page else ''
-        # Its further output is read and ignored.
-        threading.Thread(target=node.stderr.read, daemon=True).start()
+    with (
+        Device() as device,
+        tempfile.TemporaryDirectory() as folder,
+        node(device.port.name, '--record', folder, page=page) as (pid, url),
+    ):
         children = [child('subscriber'), child('bare'), *([child('looker', url)] if page else [])]
         subscriber, bare = children[:2]
-        for process in children:
-            assert process.stdout is not None
-            process.stdout.readline()
+        until_ready(*children)
         time.sleep(settle)
-        used, began = cpu_seconds(node.pid), time.monotonic()
+        used, began = cpu_seconds(pid), time.monotonic()
         time.sleep(seconds)
-        into.shares.append((cpu_seconds(node.pid) - used) / (time.monotonic() - began))
+        into.shares.append((cpu_seconds(pid) - used) / (time.monotonic() - began))
         published, _ = bare.communicate()
         heard, _ = subscriber.communicate()
         if page:
@@ -284,10 +294,6 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
             # Even on a busy machine every block must arrive; up to half of them may still be under way.
             if int(reported) < 0.5 * BLOCKS_PER_S * seconds:
                 raise SystemExit(f'the page told of {reported} blocks in {seconds:g} s')
-        node.terminate()
-        node.wait(60.0)
-    device.stop.set()
-    device.thread.join()
     since = int(began * 1e9)
     sent = dict(json.loads(published))
     written = np.array(device.written)
@@ -339,47 +345,31 @@ def start(times: int) -> Row:
     """From the command to the first callback in a process that listens already; the limit is a bare publisher's."""
     seconds: dict[str, list[float]] = {'/link_tip/deflection': [], '/bare': []}
     for _ in range(times):
-        device = Device()
-        device.thread.start()
-        subscriber = child('subscriber')
-        began: dict[str, int] = {}
-        # Its own discovery is over before the others begin.
-        time.sleep(START_S)
-        began['/bare'] = time.monotonic_ns()
-        bare = child('bare')
-        time.sleep(START_S)
-        began['/link_tip/deflection'] = time.monotonic_ns()
-        node = begin(device.port.name)
-        assert node.stderr is not None
-        threading.Thread(target=node.stderr.read, daemon=True).start()
-        assert subscriber.stdout is not None
-        # It says so once it has heard both.
-        subscriber.stdout.readline()
-        bare.communicate()
-        heard, _ = subscriber.communicate()
-        node.terminate()
-        node.wait(60.0)
-        device.stop.set()
-        device.thread.join()
+        with Device() as device:
+            subscriber = child('subscriber')
+            # Its own discovery is over before the others begin.
+            time.sleep(START_S)
+            began = {'/bare': time.monotonic_ns()}
+            bare = child('bare')
+            time.sleep(START_S)
+            began['/link_tip/deflection'] = time.monotonic_ns()
+            with node(device.port.name):
+                # It says so once it has heard both.
+                until_ready(subscriber)
+                bare.communicate()
+                heard, _ = subscriber.communicate()
         for topic, durations in seconds.items():
             first = min(t for name, _, t in json.loads(heard) if name == topic)
             durations.append((first - began[topic]) / 1e9)
-    return Row(
-        'start: command to first published estimate',
-        's',
-        [
-            figure('psd_deflection estimator', 'ours', seconds['/link_tip/deflection']),
-            figure('import rclpy, a bare publisher, DDS discovery', 'limit', seconds['/bare'], 1.2),
-        ],
-    )
+    ours = figure('psd_deflection estimator', 'ours', seconds['/link_tip/deflection'])
+    limit = figure('import rclpy, a bare publisher, DDS discovery', 'limit', seconds['/bare'], 1.2)
+    return Row('start: command to first published estimate', 's', [ours, limit])
 
 
 def live_rows(alone: Latencies, with_page: Latencies, bare_parts: list[float]) -> list[Row]:
     rows = []
-    for what, latencies, bounds, most in (
-        ('', alone, (1.4, 1.2), 1.25),
-        (', live page looked at', with_page, (None, None), 1.5),
-    ):
+    both = (('', alone, (1.4, 1.2), 1.25), (', live page looked at', with_page, (None, None), 1.5))
+    for what, latencies, bounds, most in both:
         for word, percent, parts, bound in (('median', 50, 10, bounds[0]), ('99th percentile', 99, 3, bounds[1])):
             # In parts of the run, so that there is a spread.
             ours, bare = (
@@ -417,11 +407,7 @@ def main() -> int:
         roles[args.role]()
     else:
         rows = live(args.seconds, args.settle, args.rounds)
-        if args.starts:
-            rows.append(start(args.starts))
-        for row in rows:
-            notify(row)
-        keep(rows, args.results)
+        keep([*rows, start(args.starts)] if args.starts else rows, args.results)
     return 0
 
 

@@ -12,22 +12,19 @@ from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.action import ActionClient
-from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
-from bench.campaign.plant import PERIOD_S, URDF, Spun, message_of
+from bench.campaign.plant import LONGEST_S, NAMES, NOMINAL, PERIOD_S, URDF, Spun, message_of, move_to
 from bench.simulated_arm import SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.records import FloatArray
 from tools.program import ROOT, Program
 
 HERE = ROOT / 'bench' / 'ros2_control'
-NAMES = ('shoulder', 'elbow')
-LONGEST_S = 60.0
 FASTEST = 4.0  # Bound of the shaped motion, rad/s: it goes at most 0.4 rad in 0.4 s, from a motion of as much.
 STATES_S = 0.002  # Time between two messages of the joints.
 
@@ -37,7 +34,7 @@ class Arm(Spun):
 
     def __init__(self) -> None:
         super().__init__('mock_hardware')
-        self.bent = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, np.array([1.2, 0.6]))
+        self.bent = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, NOMINAL)
         self.bent.force = np.array([0.0, 0.0, -20.0])
         self.positions: list[FloatArray] = []
         self._noise = np.random.default_rng(0)
@@ -81,7 +78,7 @@ def run(*words: str) -> None:
 
 
 def started(*words: str, until: str) -> Program:
-    out = Program(list(words))
+    out = Program(words)
     out.until(until)
     return out
 
@@ -106,25 +103,23 @@ def shaped(arm: Arm, programs: list[Program]) -> None:
 
 
 def move(chance: np.random.Generator) -> JointTrajectory:
-    end = np.array([1.2, 0.6]) + chance.uniform(-0.2, 0.2, 2)
-    at = Duration(nanoseconds=400_000_000).to_msg()
-    point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)
-    return JointTrajectory(joint_names=list(NAMES), points=[point])
+    return move_to(NOMINAL + chance.uniform(-0.2, 0.2, 2), 0.4)
 
 
 def followed(arm: Arm, chance: np.random.Generator) -> None:
     """Goals that replace each other, a cancelled one, one of no joint. SystemExit if one ends otherwise."""
     arm.spin(LONGEST_S, arm.goals.server_is_ready, "the shaper's action")
 
-    def ends(handle: Any) -> Any:
-        future = handle.get_result_async()
-        arm.spin(LONGEST_S, future.done, 'the result of a goal')
+    def came(future: Any, what: str) -> Any:
+        arm.spin(LONGEST_S, future.done, what)
         return future.result()
 
+    def ends(handle: Any) -> Any:
+        return came(handle.get_result_async(), 'the result of a goal')
+
     def sent(trajectory: JointTrajectory) -> Any:
-        future = arm.goals.send_goal_async(FollowJointTrajectory.Goal(trajectory=trajectory))
-        arm.spin(LONGEST_S, future.done, 'the answer to a goal')
-        return future.result()
+        goal = FollowJointTrajectory.Goal(trajectory=trajectory)
+        return came(arm.goals.send_goal_async(goal), 'the answer to a goal')
 
     handles = []
     for _ in range(20):
@@ -165,11 +160,9 @@ def compensated(arm: Arm, programs: list[Program]) -> None:
     before = arm.error(begun)
     client = arm.node.create_client(SetBool, '/compensator/enable')
     arm.spin(LONGEST_S, client.service_is_ready, 'the service')
-    answer = client.call_async(SetBool.Request(data=True))
-    arm.spin(LONGEST_S, answer.done, 'its answer')
+    arm.spin(LONGEST_S, client.call_async(SetBool.Request(data=True)).done, 'its answer')
     arm.spin(LONGEST_S, lambda: arm.error(begun) < 0.05 * before, 'the rigid pose')
-    answer = client.call_async(SetBool.Request(data=False))
-    arm.spin(LONGEST_S, answer.done, 'its answer')
+    arm.spin(LONGEST_S, client.call_async(SetBool.Request(data=False)).done, 'its answer')
     arm.spin(LONGEST_S, lambda: bool(np.abs(arm.positions[-1] - begun).max() < 1e-4), 'no offset')
     step = arm.step(since)
     print(f'compensator: {before * 1e3:.2f} mm without; the largest step of the joints is {step:.5f} rad')

@@ -67,8 +67,7 @@ def shares(row: Row, machine: Mapping[str, Any]) -> str:
 
 def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cpu_machine: Mapping[str, Any]) -> str:
     table = ['| work | psd_deflection | beside | ratio (wanted) |', '|---|---|---|---|']
-    for row in rows:
-        table += lines_of(row)
+    table += [line for row in rows for line in lines_of(row)]
     text = TEMPLATE.read_text(encoding='utf-8')
     text = text.replace('<!-- machine -->', measured(machine)).replace('<!-- table -->', '\n'.join(table))
     return text.replace('<!-- cpu -->', shares(cpu[0], cpu_machine))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.rows import BY_HAND, Row, figure, keep, notify, piped
+from bench.rows import BY_HAND, Row, figure, keep, piped
 from psd_deflection.base.log import null_log
 
 SETTLE_S = 3.0
@@ -106,11 +106,8 @@ def main() -> int:
     parser.add_argument('--rigs', type=int, default=1, help=argparse.SUPPRESS)
     parser.add_argument('--ports', type=json.loads, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.role == 'devices':
-        devices(args.rigs)
-        return 0
-    if args.role == 'sessions':
-        sessions(args.ports, args.seconds)
+    if args.role:
+        devices(args.rigs) if args.role == 'devices' else sessions(args.ports, args.seconds)
         return 0
     print('rigs in one process on one core, without recording')
     most, count = 0, 1
@@ -125,8 +122,6 @@ def main() -> int:
         most, count = count, 2 * count
     name = f'{most} tried without a loss' if count > args.most else f'{count} lose samples'
     rigs = Row('rigs in one process on one core', 'rigs', [figure(name, 'ours', [most], WANTED)])
-    for row in (rigs, curve):
-        notify(row)
     keep([rigs, curve], args.results)
     return 0
 

@@ -23,8 +23,6 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / 'bench' / 'results.json'
 BY_HAND = ROOT / 'build' / 'bench'  # Where a bench leaves what it finds, unless --results names a file.
 PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas')
-
-
 STEADY = 0.25  # Quartiles that are further apart than this share of their median: load from outside shows in them.
 
 
@@ -96,9 +94,8 @@ def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
             began = time.perf_counter()
             job()
             taken.append((time.perf_counter() - began) * scale)
-    return Row(
-        work, unit, [figure(n, kind, taken, bound) for (n, kind, _, bound), taken in zip(jobs, seconds, strict=True)]
-    )
+    both = zip(jobs, seconds, strict=True)
+    return Row(work, unit, [figure(name, kind, taken, bound) for (name, kind, _, bound), taken in both])
 
 
 def piped(module: str, *words: str) -> subprocess.Popen[str]:
@@ -119,7 +116,10 @@ def notify(row: Row) -> None:
         print(words, flush=True)
 
 
-def keep(rows: Sequence[Row], path: Path) -> None:
+def keep(rows: Sequence[Row], path: Path, *, notified: bool = True) -> None:
+    """Into the file of results, and printed unless not ``notified``."""
+    for row in rows if notified else ():
+        notify(row)
     by_work = {row.work: row for row in (read(path)[0] if path.is_file() else [])}
     by_work.update((row.work, row) for row in rows)
     tree = {'machine': machine(), 'rows': [asdict(row) for row in by_work.values()]}
@@ -138,12 +138,7 @@ def machine() -> dict[str, object]:
     """Where and of what the figures are; the load of the machine by others, of which the spread comes."""
     processor = re.search(r'model name\s*: (.+)', Path('/proc/cpuinfo').read_text(encoding='utf-8'))
     done = subprocess.run(['git', 'rev-parse', '--short=10', 'HEAD'], cwd=ROOT, capture_output=True, text=True)
-    return {
-        'date': datetime.now(UTC).date().isoformat(),
-        'commit': done.stdout.strip(),
-        'processor': processor[1] if processor else platform.machine(),
-        'cores': os.cpu_count(),
-        'load': round(os.getloadavg()[0], 1),
-        'python': platform.python_version(),
-        'versions': {name: importlib.metadata.version(name) for name in PACKAGES},
-    }
+    out: dict[str, object] = {'date': datetime.now(UTC).date().isoformat(), 'commit': done.stdout.strip()}
+    out |= {'processor': processor[1] if processor else platform.machine(), 'cores': os.cpu_count()}
+    out |= {'load': round(os.getloadavg()[0], 1), 'python': platform.python_version()}
+    return out | {'versions': {name: importlib.metadata.version(name) for name in PACKAGES}}

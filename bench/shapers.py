@@ -32,13 +32,8 @@ def move() -> Trajectory:
 
 def played(trajectory: Trajectory) -> float:
     """Amplitude of the end effector's vibration after the trajectory, m."""
-    arm = SimulatedArm(
-        read_chain(ROOT / 'config' / 'two_links.yaml').chain,
-        START,
-        frequency=FREQUENCY,
-        damping=RATIO,
-        mass=float(np.linalg.norm(PAYLOAD)) / GRAVITY,
-    )
+    chain, mass = read_chain(ROOT / 'config' / 'two_links.yaml').chain, float(np.linalg.norm(PAYLOAD)) / GRAVITY
+    arm = SimulatedArm(chain, START, frequency=FREQUENCY, damping=RATIO, mass=mass)
     arm.force = PAYLOAD
     arm.settle()
     times = np.arange(0.0, trajectory.duration + SETTLED_S, STEP_S)
@@ -55,10 +50,8 @@ def unshaped() -> float:
 
 def residual(shaper: Shaper) -> float:
     """Amplitude after the shaped move over that after the move as it is."""
-    return (
-        played(TrajectoryShaper(shaper).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
-        / unshaped()
-    )
+    start = standing(dict(zip(NAMES, START.tolist(), strict=True)))
+    return played(TrajectoryShaper(shaper).shape(0, move(), start)) / unshaped()
 
 
 SHAPER_HEAD = ('shaper', 'longer by', '5 % too low', 'right', '5 % too high')
@@ -69,6 +62,6 @@ def rows() -> list[tuple[str, ...]]:
     out = []
     for kind in KINDS:
         shares = [residual(shaper(kind, FREQUENCY * wrong, RATIO)) for wrong in WRONG]
-        longer = shaper(kind, FREQUENCY, RATIO).duration
-        out.append((kind.upper(), f'{1e3 * longer:.0f} ms', *(f'{100.0 * share:.1f} %' for share in shares)))
+        longer = f'{1e3 * shaper(kind, FREQUENCY, RATIO).duration:.0f} ms'
+        out.append((kind.upper(), longer, *(f'{100.0 * share:.1f} %' for share in shares)))
     return out

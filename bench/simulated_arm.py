@@ -12,7 +12,6 @@ from psd_deflection.arms.chains.chain import Chain, EndEffector, TipDeflection
 from psd_deflection.records import FloatArray
 
 LAG_S = 0.02  # Time constant of the joints.
-
 _CERTAIN = np.zeros((3, 3))
 
 

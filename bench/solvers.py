@@ -79,38 +79,28 @@ def main() -> None:
     blocks = parser.parse_args().blocks
     geometry = thesis_geometry()
     dots = some_blocks(blocks)
-
     print(f'{blocks} blocks at once, with covariance, residual and status')
-    seconds = {}
+    seconds = []
     solver = make_solver('exact', geometry)
-    for label, variances in (
-        ('exact, one set of variances', VARIANCES),
-        ('exact, variances of each block, x and y unlike', np.tile((4e-12, 1e-12, 9e-12, 2e-12), (blocks, 1))),
-    ):
-        seconds[label] = best_of(functools.partial(solver.solve_many, dots, variances), 3) / blocks
-    for label, value in seconds.items():
-        print(f'  {label:50} {1e6 * value:9.3f} us a block')
+    of_each = np.tile((4e-12, 1e-12, 9e-12, 2e-12), (blocks, 1))
+    for label, variances in (('one set of variances', VARIANCES), ('variances of each block, x and y unlike', of_each)):
+        seconds.append(best_of(functools.partial(solver.solve_many, dots, variances), 3) / blocks)
+        print(f'  {f"exact, {label}":50} {1e6 * seconds[-1]:9.3f} us a block')
     peer = best_of(functools.partial(peer_least_squares, dots[:500]), 3) / 500
-    ratio = peer / seconds['exact, one set of variances']
+    ratio = peer / seconds[0]
     print(f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us, exact is {ratio:.0f} times as fast')
-
     print('one block at a time, with covariance')
     sample = tuple(dots[0].tolist())
     default = 0.0
-    for name in SOLVERS:
-        if name in ('pose', 'base_pair'):
-            continue
+    alike, unlike = ('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))
+    for name in (name for name in SOLVERS if name not in ('pose', 'base_pair')):
         solver = make_solver(name, geometry)
-        for label, single in (('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))):
-            if label and name != 'exact':
-                continue
+        for label, single in (alike, unlike) if name == 'exact' else (alike,):
             value = best_of(functools.partial(repeat, solver, sample, single)) / 200
             default = default or value
             print(f'  {name + label:50} {1e6 * value:9.1f} us')
-    for text, solve in (
-        ('scipy.optimize.least_squares', peer_least_squares),
-        ('numpy.linalg.lstsq, linear, no covariance', peer_lstsq),
-    ):
+    linear = 'numpy.linalg.lstsq, linear, no covariance'
+    for text, solve in (('scipy.optimize.least_squares', peer_least_squares), (linear, peer_lstsq)):
         value = best_of(functools.partial(solve, dots[:200])) / 200
         print(f'  {text:50} {1e6 * value:9.1f} us, exact is {value / default:.0f} times as fast')
 

@@ -76,11 +76,9 @@ class ServedController:
         self._handle: Any = None
         self._reported = 0.0
         self.rejected: list[str] = []
-        kind = action_class(SERVED[FOLLOW].type)
-        self._kind = kind
-        self._server = GuardedServer(
-            node, kind, name, self.rejected.append, self._asked, self._accepted, self._cancelled
-        )
+        self._kind = kind = action_class(SERVED[FOLLOW].type)
+        calls = self.rejected.append, self._asked, self._accepted, self._cancelled
+        self._server = GuardedServer(node, kind, name, *calls)
 
     def _asked(self, goal: Any) -> Any:
         from rclpy.action import GoalResponse

@@ -132,9 +132,8 @@ def drawn(name: str) -> Hand:
     elif kind == 'near':
         off = np.round(rng.choice((-1.0, 1.0), len(times)) * rng.uniform(4e-3, 28e-3, len(times)), 3)
         annotated = _held(levels, times + off, n)
-        wrong = [
-            {'name': 'load_time', 'where': f'load {i}', 'value': late} for i, late in enumerate(off.tolist(), start=1)
-        ]
+        named = ((f'load {i}', late) for i, late in enumerate(off.tolist(), start=1))
+        wrong = [{'name': 'load_time', 'where': where, 'value': late} for where, late in named]
     elif kind == 'cell':
         annotated = effective + rng.normal(size=effective.shape) * np.array(CELL)
     elif kind == 'sway':

@@ -92,11 +92,8 @@ def measured(rig: Rig, volts: Array, zero_after: int = 25) -> tuple[Array, Array
             estimates += records
         elif pipeline.zero() is None:
             raise RuntimeError(f'no zero: {pipeline.zero_rejected}')
-    return (
-        np.array([e.block for e in estimates]),
-        np.array([e.pose for e in estimates]),
-        np.array([e.covariance for e in estimates]).reshape(-1, 3, 3),
-    )
+    block, pose, covariance = (np.array([getattr(e, n) for e in estimates]) for n in ('block', 'pose', 'covariance'))
+    return block, pose, covariance.reshape(-1, 3, 3)
 
 
 def shares_left_open(truth: Mapping[str, float], pose: Array, frames: npt.NDArray[np.int64]) -> dict[str, float]:
@@ -166,25 +163,16 @@ def score(seed: int, lit: bool = False) -> Score:
     unreported = [n for n, s in package_shares.items() if s > OPEN + BORDER and n not in every]
     message = [n for n in reported & alone if package_shares.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
-    again = misaligned.record(
-        shifted(truth, group, rng) if group else truth, later_motion(rng), rng, outliers=0.01, light=light
-    )
+    moved = shifted(truth, group, rng) if group else truth
+    again = misaligned.record(moved, later_motion(rng), rng, outliers=0.01, light=light)
     checked = check([run_of(again)], rig)
     axes = np.abs(error) <= Z95 * np.sqrt(np.einsum('nii->ni', covariance))
-    return Score(
-        z,
-        float(np.mean(distance <= CHI95)),
-        axes.mean(axis=0),
-        float(np.mean(noise_distance <= CHI95)),
-        np.sqrt(np.mean(error_0**2, axis=0)),
-        np.sqrt(np.mean(error**2, axis=0)),
-        (calibration.gap.heldout_before, calibration.gap.heldout_after),
-        unreported,
-        message,
-        group,
-        '' if checked.unchanged else checked.groups[0].group,
-        checked.like,
-    )
+    inside, noise_only = (float(np.mean(d <= CHI95)) for d in (distance, noise_distance))
+    before, after = (np.sqrt(np.mean(e**2, axis=0)) for e in (error_0, error))
+    gap = calibration.gap.heldout_before, calibration.gap.heldout_after
+    named = '' if checked.unchanged else checked.groups[0].group
+    shown = z, inside, axes.mean(axis=0), noise_only, before, after, gap
+    return Score(*shown, unreported, message, group, named, checked.like)
 
 
 def errors_over_sd(seed: int, reference: float) -> dict[str, float]:
@@ -194,9 +182,8 @@ def errors_over_sd(seed: int, reference: float) -> dict[str, float]:
     sigma = generator.SIGMA * np.exp(rng.uniform(np.log(0.25), np.log(2.0), 6))
     pose = misaligned.poses(misaligned.pushes(rng, HOLDS, SECONDS))
     sds = [reference * sd for sd in misaligned.CAMERA]
-    calibration = calibrate(
-        [run_of(misaligned.record(truth, pose, rng, sigma=sigma, reference_sd=sds))], rig_from_values({})
-    )
+    recorded = misaligned.record(truth, pose, rng, sigma=sigma, reference_sd=sds)
+    calibration = calibrate([run_of(recorded)], rig_from_values({}))
     return {n: float((calibration.values[i] - truth[n]) / calibration.sd[i]) for i, n in enumerate(NAMES) if n in truth}
 
 
@@ -205,14 +192,10 @@ POINTING = 2e-6  # rad, standard deviation by which a beam has turned since the 
 DRIFT, WARMER, AREA = 40e-6, 2.0, 10e-3
 """Largest drift of a detector, 1/K of its length, over so many K; its length, m."""
 CERTIFIED = {
-    'reference_scale': REFERENCE_SCALE,
-    'reference_angle_scale': REFERENCE_SCALE,
-    'pointing_drift': POINTING,
-    'drift_coefficient': DRIFT,
-    'temperature_change': WARMER,
+    **dict.fromkeys(('reference_scale', 'reference_angle_scale'), REFERENCE_SCALE),
     **dict.fromkeys(('profile_change', 'air_gradient', 'air_step', 'interference', 'bracket_temperature'), 0.0),
-    'zero_blocks': 25.0,
 }
+CERTIFIED |= {'pointing_drift': POINTING, 'drift_coefficient': DRIFT, 'temperature_change': WARMER, 'zero_blocks': 25.0}
 """Inputs of the certificate as this generator has them."""
 STATED, HELD = 6, 4  # Poses of each rig, one estimate at each, and blocks for which each is held.
 
@@ -291,10 +274,9 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
     for words, e in (('before', before), ('after', after)):
         yield f'| rms error {words} | {e[0] * 1e6:.2f} µm | {e[1] * 1e6:.2f} µm | {np.degrees(e[2]) * 1e3:.2f} mdeg | |'
     yield ''
-    worse = [
-        s.gap[1] > s.gap[0] or np.linalg.norm(s.after * length) > np.linalg.norm(s.before * length) for s in scores
-    ]
-    yield f'- rigs that came out worse: {sum(map(bool, worse))} of {len(scores)}'
+    norms = [[np.linalg.norm(e * length) for e in (s.before, s.after)] for s in scores]
+    worse = sum(bool(s.gap[1] > s.gap[0] or b > a) for s, (a, b) in zip(scores, norms, strict=True))
+    yield f'- rigs that came out worse: {worse} of {len(scores)}'
     unreported = sum(len(s.unreported) for s in scores)
     yield f'- parameters that the Fisher information leaves open and nothing reports: {unreported} of {every_z.size}'
     yield f'- parameters reported as open that it does not leave open: {sum(len(s.message) for s in scores)}'

@@ -20,15 +20,11 @@ BLOCK = 20
 FLOOR = generator.SIGMA * generator.MM_PER_V / math.sqrt(BLOCK)
 SIZES = (1.0, 3.0, 10.0)
 NOISES = ('heavy', 'coloured', 'loud', 'flicker')  # Other noise than the rig file's.
-
-SHOWS_ACROSS_LENGTHS = frozenset(
-    (
-        *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
-        *('self_weight', 'mount_tilt', 'tip_force'),
-    )
-)
+SHOWS_ACROSS_LENGTHS = {
+    *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+    *('self_weight', 'mount_tilt', 'tip_force'),
+}
 """Effects that one link length cannot distinguish; half of their cases have two lengths."""
-
 SUITE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name('suite.toml').read_text(encoding='utf-8'))
 MIMICKED: Mapping[str, str] = SUITE['mimicked']
 
@@ -66,27 +62,20 @@ def _signed(rng: np.random.Generator) -> tuple[float, float]:
     return math.cos(angle), math.sin(angle)
 
 
-def _xy(scale: float, names: tuple[str, str] = ('x', 'y'), psd: bool = False, **more: Any) -> Draw:
+def _draw_of(*names: str, scale: float, signed: bool = True, psd: bool = False, **more: Any) -> Draw:
+    """Of one value, with a sign by chance, or of two, with an angle by chance."""
+
     def draw(rng: np.random.Generator, size: float) -> dict[str, Any]:
-        a, b = _signed(rng)
-        out = {
-            names[0]: scale * size * a,
-            names[1]: scale * size * b,
-            **{k: int(rng.choice(v)) for k, v in more.items()},
-        }
-        return {'psd': int(rng.integers(1, 3)), **out} if psd else out
-
-    return draw
-
-
-def _draw_of(name: str, scale: float, signed: bool = True, psd: bool = False, **more: Any) -> Draw:
-    def draw(rng: np.random.Generator, size: float) -> dict[str, Any]:
-        sign = float(rng.choice((-1.0, 1.0))) if signed else 1.0
-        out: dict[str, Any] = {name: sign * scale * size}
+        signs = _signed(rng) if len(names) == 2 else [float(rng.choice((-1.0, 1.0))) if signed else 1.0]
+        out: dict[str, Any] = {name: scale * size * sign for name, sign in zip(names, signs, strict=True)}
         out.update({k: int(rng.choice(v)) for k, v in more.items()})
         return {'psd': int(rng.integers(1, 3)), **out} if psd else out
 
     return draw
+
+
+def _xy(scale: float, names: tuple[str, str] = ('x', 'y'), **more: Any) -> Draw:
+    return _draw_of(*names, scale=scale, **more)
 
 
 def _creep(rng: np.random.Generator, size: float) -> dict[str, Any]:
@@ -99,21 +88,13 @@ def _damping(rng: np.random.Generator, size: float) -> dict[str, Any]:
 
 
 def _second(rng: np.random.Generator, size: float) -> dict[str, Any]:
-    return {
-        'frequency': float(rng.uniform(60.0, 110.0)),
-        'damping_ratio': float(rng.uniform(0.01, 0.03)),
-        'shares': int(rng.integers(0, 3)),
-        'gain': 1e-3 * size,
-    }
+    frequency, ratio = float(rng.uniform(60.0, 110.0)), float(rng.uniform(0.01, 0.03))
+    return {'frequency': frequency, 'damping_ratio': ratio, 'shares': int(rng.integers(0, 3)), 'gain': 1e-3 * size}
 
 
 def _ambient(rng: np.random.Generator, size: float) -> dict[str, Any]:
-    return {
-        'psd': int(rng.integers(1, 3)),
-        'x': float(rng.uniform(-3e-3, 3e-3)),
-        'y': float(rng.uniform(-3e-3, 3e-3)),
-        'level': 1e-3 * size,
-    }
+    psd, (x, y) = int(rng.integers(1, 3)), rng.uniform(-3e-3, 3e-3, 2).tolist()
+    return {'psd': psd, 'x': x, 'y': y, 'level': 1e-3 * size}
 
 
 def _mains(rng: np.random.Generator, size: float) -> dict[str, Any]:
@@ -131,47 +112,47 @@ def _saturation(rng: np.random.Generator, size: float) -> dict[str, Any]:
 
 
 DRAWS: Mapping[str, Draw] = {
-    'bending_stiffness': _draw_of('scale', 1e-3, moves_frequency=(0, 1)),
-    'torsional_stiffness': _draw_of('scale', 1e-3, moves_frequency=(0, 1)),
-    'clamp_bending_compliance': _draw_of('compliance', 1e-7, signed=False),
-    'clamp_torsional_compliance': _draw_of('compliance', 1e-6, signed=False),
-    'clamp_friction': _draw_of('width', 1e-6, signed=False, axis=(1, 2, 3)),
+    'bending_stiffness': _draw_of('scale', scale=1e-3, moves_frequency=(0, 1)),
+    'torsional_stiffness': _draw_of('scale', scale=1e-3, moves_frequency=(0, 1)),
+    'clamp_bending_compliance': _draw_of('compliance', scale=1e-7, signed=False),
+    'clamp_torsional_compliance': _draw_of('compliance', scale=1e-6, signed=False),
+    'clamp_friction': _draw_of('width', scale=1e-6, signed=False, axis=(1, 2, 3)),
     'creep': _creep,
     'damping': _damping,
-    'tip_mass': _draw_of('mass', 1e-3, signed=False),
+    'tip_mass': _draw_of('mass', scale=1e-3, signed=False),
     'second_bending_mode': _second,
-    'self_weight': _draw_of('weight_per_length', 0.1, signed=False),
+    'self_weight': _draw_of('weight_per_length', scale=0.1, signed=False),
     'mount_tilt': _xy(1e-6),
     'load_offset': _xy(1e-4),
-    'load_direction': _draw_of('angle', 1e-3),
-    'plane_tilt': _draw_of('slope_ratio', 1.0, signed=False),
+    'load_direction': _draw_of('angle', scale=1e-3),
+    'plane_tilt': _draw_of('slope_ratio', scale=1.0, signed=False),
     'laser_pointing_drift': _xy(1e-7, ('rate_x', 'rate_y'), psd=True),
     'refraction': _xy(1e-7),
-    'sensor_rotation': _draw_of('angle', 1e-3, psd=True),
+    'sensor_rotation': _draw_of('angle', scale=1e-3, psd=True),
     'sensor_position': _xy(1e-4, psd=True, aimed=(0, 1)),
     'sensor_gain': _xy(1e-3, psd=True),
-    'sensor_nonlinearity': _draw_of('k', 100.0, psd=True),
+    'sensor_nonlinearity': _draw_of('k', scale=100.0, psd=True),
     'axis_crosstalk': _xy(1e-3, ('xy', 'yx'), psd=True),
     'ambient_light': _ambient,
     'thermal_drift': _xy(1e-7, psd=True),
-    'spot_clipping': _draw_of('radius', 1e-3, signed=False, psd=True, profile=(1, 2)),
+    'spot_clipping': _draw_of('radius', scale=1e-3, signed=False, psd=True, profile=(1, 2)),
     'mains_interference': _mains,
     'amplifier_saturation': _saturation,
-    'amplifier_lag': _draw_of('time_constant', 1e-4, signed=False),
-    'channel_skew': _draw_of('delay', 1e-4, signed=False, psd=True),
-    'quantisation': _draw_of('step', 1e-3, signed=False),
+    'amplifier_lag': _draw_of('time_constant', scale=1e-4, signed=False),
+    'channel_skew': _draw_of('delay', scale=1e-4, signed=False, psd=True),
+    'quantisation': _draw_of('step', scale=1e-3, signed=False),
     'tip_force': _xy(1e-2),
-    'alien_cubic_spring': _draw_of('size', 1e-4),
-    'alien_quadratic_load': _draw_of('size', 1e-9),
-    'alien_soft_mode': _draw_of('size', 1e-4),
-    'alien_square_crosstalk': _draw_of('size', 1.0),
-    'alien_thermal_square': _draw_of('size', 1e-7),
-    'alien_gain_drift': _draw_of('size', 1e-4),
-    'alien_thermal_gain': _draw_of('size', 1e-4),
-    'alien_rectifier': _draw_of('size', 1e-3),
-    'alien_walk': _draw_of('size', 1e-8, seed=tuple(range(100))),
-    'alien_backlash': _draw_of('size', 1e-6, signed=False),
-    'alien_beat': _draw_of('size', 1e-6),
+    'alien_cubic_spring': _draw_of('size', scale=1e-4),
+    'alien_quadratic_load': _draw_of('size', scale=1e-9),
+    'alien_soft_mode': _draw_of('size', scale=1e-4),
+    'alien_square_crosstalk': _draw_of('size', scale=1.0),
+    'alien_thermal_square': _draw_of('size', scale=1e-7),
+    'alien_gain_drift': _draw_of('size', scale=1e-4),
+    'alien_thermal_gain': _draw_of('size', scale=1e-4),
+    'alien_rectifier': _draw_of('size', scale=1e-3),
+    'alien_walk': _draw_of('size', scale=1e-8, seed=tuple(range(100))),
+    'alien_backlash': _draw_of('size', scale=1e-6, signed=False),
+    'alien_beat': _draw_of('size', scale=1e-6),
 }
 EFFECTS = tuple(n for n in DRAWS if not n.startswith('alien_'))
 ALIENS = tuple(n for n in DRAWS if n.startswith('alien_'))
@@ -317,7 +298,6 @@ def cases_by_hand(first: int, hand: int) -> Iterator[Case]:
 MISTAKES: Mapping[str, Sequence[float]] = SUITE['mistakes']
 FAULTLESS = (('gaps', 0.3), ('outliers', 0.01), ('under_load', 0.0), ('own_zeros', 3e-4))
 """Recordings that look odd and are right: share of the samples, share, nothing, m."""
-
 SPREADS = ((3.0, 30.0), (3.0, 300.0), (3.0, 30.0, 300.0))
 """Gaps of effects that act together, in floors: the small ones must not vanish behind the large ones."""
 
@@ -329,9 +309,8 @@ def hard_cases(first: int, spreads: int, mistakes: int) -> Iterator[Case]:
         gaps = SPREADS[i % len(SPREADS)]
         names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], len(gaps), replace=False)]
         two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
-        yield Case(
-            f'spread-{i}-{"-".join(names)}', 'spread', 'two' if two else 'one', tuple(zip(names, gaps, strict=True))
-        )
+        wanted = tuple(zip(names, gaps, strict=True))
+        yield Case(f'spread-{i}-{"-".join(names)}', 'spread', 'two' if two else 'one', wanted)
     for name, sizes in MISTAKES.items():
         for k in range(min(mistakes, len(sizes))):
             yield Case(f'mistake-{name}-{k}-{first}', 'mistake', 'one', (), mistake=(name, float(sizes[k])))
@@ -346,13 +325,9 @@ UNSPREAD = frozenset(('amplifier_saturation', 'quantisation', 'plane_tilt', 'sen
 
 def short_cases() -> list[Case]:
     """Return a small selection to run on every change: a few of each kind."""
-    out = [
-        Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),))
-        for name, gap in (
-            *(('sensor_rotation', 3.0), ('plane_tilt', 3.0), ('creep', 3.0), ('amplifier_lag', 10.0)),
-            *(('quantisation', 3.0), ('spot_clipping', 10.0)),
-        )
-    ]
+    gaps = {'sensor_rotation': 3.0, 'plane_tilt': 3.0, 'creep': 3.0, 'amplifier_lag': 10.0, 'quantisation': 3.0}
+    listed = (*gaps.items(), ('spot_clipping', 10.0))
+    out = [Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),)) for name, gap in listed]
     out.append(Case('pair-s', 'pair', 'one', (('sensor_gain', 5.0), ('load_direction', 5.0))))
     out.append(Case('alien-s', 'alien', 'one', (('alien_square_crosstalk', 10.0),)))
     out.append(Case('spread-s', 'spread', 'one', (('sensor_rotation', 3.0), ('load_direction', 300.0))))

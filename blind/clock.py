@@ -17,7 +17,10 @@ from psd_deflection.studies.validate.clock import Motion, Offset, clock_offset
 MODES = ((14.0, 2.0e-3), (14.0, -1.2e-3), (21.0, 8.0e-3))  # Hz, and m, m, rad a step.
 
 
-def truth(t: Array, steps: tuple[float, ...] = (1.0, 3.7)) -> Array:
+Steps = tuple[float, ...]
+
+
+def truth(t: Array, steps: Steps = (1.0, 3.7)) -> Array:
     """Poses (k, 3) at ``t``, s: steps up and down in turn, each with its ringing (damping ratio 0.02)."""
     out = np.zeros((len(t), 3))
     for number, start in enumerate(steps):
@@ -44,12 +47,7 @@ REFERENCE_SD = np.array([10e-6, 10e-6, 3e-4])
 
 
 def simulated(
-    seed: int,
-    *,
-    seconds: float = 6.0,
-    rate: float = 30.0,
-    exposure: float = 0.008,
-    steps: tuple[float, ...] = (1.0, 3.7),
+    seed: int, *, seconds: float = 6.0, rate: float = 30.0, exposure: float = 0.008, steps: Steps = (1.0, 3.7)
 ) -> ClockRecording:
     """Samples at 1 kHz with 2 µm of noise, and a camera at ``rate`` a second that takes means over ``exposure``, s."""
     rng = np.random.default_rng(seed)
@@ -58,13 +56,8 @@ def simulated(
     middles = np.arange(0.0, seconds, 1.0 / rate) + float(rng.uniform(0.0, 1.0 / rate))
     within = np.linspace(-0.5, 0.5, 41) * exposure
     poses = np.mean([truth(middles + u, steps) for u in within], axis=0)
-    return ClockRecording(
-        t,
-        flat_dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4)),
-        middles - offset,
-        poses + rng.normal(0.0, REFERENCE_SD, poses.shape),
-        offset,
-    )
+    dots = flat_dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4))
+    return ClockRecording(t, dots, middles - offset, poses + rng.normal(0.0, REFERENCE_SD, poses.shape), offset)
 
 
 RIG = load_rig(None)

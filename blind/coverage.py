@@ -177,22 +177,25 @@ def rig(row: Row, **overrides: object) -> Rig:
 @cache
 def motion(rest_s: int, steps: int, every_s: int = 5, size: int = SIZE) -> tuple[Array, Array]:
     """Volts (n, 6) without noise and poses at the middles of blocks of ``size``."""
+    fine = stepped(rest_s, steps, every_s)
+    return optics_of(fine), middles(fine, size)
+
+
+def stepped(rest_s: int, steps: int, every_s: int = 5) -> Array:
+    """Poses on the fine grid: at rest, then 50 N on and off."""
     n, dwell = rest_s * 1000, every_s * 1000
     loads = np.zeros((n + steps * dwell, 3))
     for step in range(0, steps, 2):
         # Off the blocks' grid, each at another place in its block.
-        first = n + step * dwell + 7 * step % SIZE
-        loads[first : first + dwell] = (0.0, -50.0, -29.25)
-    fine = generator.motion(loads, 0.585, [])
-    return optics_of(fine), middles(fine, size)
+        loads[n + step * dwell + 7 * step % SIZE :][:dwell] = (0.0, -50.0, -29.25)
+    return generator.motion(loads, 0.585, [])
 
 
 def optics_of(fine: Array, warm: Array | None = None, effects: Sequence[generator.Spec] = ()) -> Array:
     """Volts (n, 6) without noise; ``warm``: K above the first temperature, for ``effects`` of the sensors."""
     none = np.zeros(len(fine))
-    shifted = [
-        {'name': 'sensor_position', 'psd': i, 'x': x, 'y': y, 'aimed': False} for i, (x, y) in enumerate(SHIFTS, 1)
-    ]
+    places = ({'psd': i, 'x': x, 'y': y} for i, (x, y) in enumerate(SHIFTS, 1))
+    shifted = [{'name': 'sensor_position', 'aimed': False, **place} for place in places]
     dots = generator.optics(fine, none, none, 0.585, shifted)
     m, light = generator.sensors(dots, none, none if warm is None else warm, effects)
     return generator.electronics(m, light, none, [])
@@ -212,8 +215,8 @@ def volts_of(row: Row, clean: Array, seed: int) -> Array:
     """What the converter gives, (n, 6) V."""
     out = clean + generator.electronic_noise(len(clean), seed, sigmas=row.sigmas, memory=row.memory, heavy=row.heavy)
     if row.corner:
-        rng = np.random.default_rng(seed)
-        out = clean + np.asarray(row.sigmas) * generator.flicker(len(clean), row.corner, rng)
+        flicker = generator.flicker(len(clean), row.corner, np.random.default_rng(seed))
+        out = clean + np.asarray(row.sigmas) * flicker
     t = np.arange(len(clean)) / generator.RATE
     out += row.hum * np.sin(2.0 * np.pi * row.mains * t)[:, None] * HUMS
     if row.offsets:
@@ -253,9 +256,8 @@ def score(
 ) -> Scored:
     """At rest from block 200 on, then a step of 50 N every 5 s."""
     clean, truth = motion(rest_s, steps, size=size)
-    if loss in IN_STEP:
-        here = ~np.isin(np.arange(len(clean)) % SIZE, list(IN_STEP[loss]))
-    else:
+    here = ~np.isin(np.arange(len(clean)) % SIZE, list(IN_STEP.get(loss, ())))
+    if loss in LOSSES:
         here = generator.present(len(clean), seed + 1000, *LOSSES[loss])
     pipeline = Pipeline(rig(row, block_size=size, **more))
     got = run(pipeline, volts_of(row, clean, seed), truth, here, zero_at=SETTLED if row.offsets else 0)
@@ -287,11 +289,7 @@ def drifting(readings: Sequence[int], seconds: int = 60, seed: int = 1) -> Insid
 def warming(reported: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
     """Readings that drift with temperature by what makers of PSDs state, ``DRIFT``, while it rises by ``RISE``.
     ``reported``: the rig file has the drift, and the temperature is told once a second, to 0.1 K."""
-    n, dwell = rest_s * 1000, 5000
-    loads = np.zeros((n + steps * dwell, 3))
-    for step in range(0, steps, 2):
-        loads[n + step * dwell + 7 * step % SIZE :][:dwell] = (0.0, -50.0, -29.25)
-    fine = generator.motion(loads, 0.585, [])
+    n, fine = rest_s * 1000, stepped(rest_s, steps)
     warm = np.linspace(0.0, RISE, len(fine))
     names = [{'name': 'thermal_drift', 'psd': psd, **drift} for psd, drift in enumerate(DRIFT, 1)]
     volts = volts_of(ROWS[0], optics_of(fine, warm, names), seed)
@@ -361,9 +359,7 @@ def coarse(poses: int = 150, seed: int = 1, *, reported: bool = True, **override
         pose = rng.uniform(-1.0, 1.0, 3) * (1e-3, 1e-3, 1e-2)
         volts = volts_of(row, optics_of(np.tile(pose, (120 * SIZE * generator.FINER, 1))), int(rng.integers(1 << 30)))
         runs.append(run(Pipeline(rig(row, **more)), volts, np.tile(pose, (120, 1))))
-    return inside(
-        *(np.concatenate(parts) for parts in zip(*((r.error[100:], r.covariance[100:]) for r in runs), strict=True))
-    )
+    return inside(*(np.concatenate([getattr(r, name)[100:] for r in runs]) for name in ('error', 'covariance')))
 
 
 def bound(row: Row) -> Array:
@@ -400,12 +396,10 @@ def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int =
     clean, truth = optics_of(fine), middles(fine)
     volts = volts_of(Row(kind), clean, seed)
     column = (0, 1, 3, 4)[channel]
-    if kind == 'dead':
-        volts[:, column] = 0.0
-    elif kind == 'stuck':
+    if kind == 'stuck':
         volts[n // 4 :, column] = volts[n // 4, column]
-    elif kind == 'inverted':
-        volts[:, column] *= -1.0
+    elif kind in ('dead', 'inverted'):
+        volts[:, column] = 0.0 if kind == 'dead' else -volts[:, column]
     else:
         pair = [3 * channel, 3 * channel + 1]
         volts[:, pair] = volts[:, pair[::-1]]
@@ -417,10 +411,8 @@ def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int =
     return float(worst), pipeline.estimator.most_likely_wrong()
 
 
-WRONG = tuple(
-    [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
-    + [('swapped', psd) for psd in range(2)]
-)
+WRONG = [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
+WRONG += [('swapped', psd) for psd in range(2)]
 
 
 def one_wrong(rows: int | None) -> int:
@@ -438,10 +430,10 @@ def one_wrong(rows: int | None) -> int:
 def tones(hz: float, size: float) -> Inside:
     """Eight runs of 16 s of :func:`shaken`, each with phases and noise of its own."""
     runs = [_shaken(hz, ROWS[0], 16, seed, size) for seed in range(1, 9)]
-    later = [run.block >= 2 * SETTLED for run in runs]
-    named = np.concatenate([np.array([bool(f) for f in r.findings])[keep] for r, keep in zip(runs, later, strict=True)])
-    errors = np.concatenate([r.error[keep] for r, keep in zip(runs, later, strict=True)])
-    return inside(errors, np.concatenate([r.covariance[keep] for r, keep in zip(runs, later, strict=True)]), named)
+    later = np.concatenate([run.block for run in runs]) >= 2 * SETTLED
+    named = np.array([bool(f) for r in runs for f in r.findings])[later]
+    error, covariance = (np.concatenate([getattr(r, n) for r in runs])[later] for n in ('error', 'covariance'))
+    return inside(error, covariance, named)
 
 
 Case = tuple[str, str, Callable[..., Inside | Scored], tuple[object, ...], dict[str, object]]
@@ -474,10 +466,8 @@ def _line(case: Case) -> str:
     got = function(*arguments, **more)
     if isinstance(got, Inside):
         return got.line(label, second)
-    return '\n'.join(
-        part.line(label, ', '.join(filter(None, (second, phase))))
-        for phase, part in (('rest', got.rest), ('ringing', got.ringing))
-    )
+    phases = (('rest', got.rest), ('ringing', got.ringing))
+    return '\n'.join(part.line(label, ', '.join(filter(None, (second, phase)))) for phase, part in phases)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

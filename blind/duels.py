@@ -102,9 +102,8 @@ def forward_backward(plant: Plant, residual: Residual, observed: BoolArray) -> F
 def stlsq(plant: Plant, y: FloatArray, observed: BoolArray) -> FloatArray:
     """The same by sequentially thresholded least squares (Brunton and others 2016), with the threshold by BIC."""
     nothing = _vector(plant.simulate({}))
-    table = np.column_stack(
-        [_vector(plant.simulate(_model([e], np.ones(1)))) - nothing for e in (*plant.nuisance, *plant.library)]
-    )
+    alone = (plant.simulate(_model([e], np.ones(1))) for e in (*plant.nuisance, *plant.library))
+    table = np.column_stack([_vector(simulated) - nothing for simulated in alone])
     table /= np.sqrt(np.mean(table[observed] ** 2, axis=0))
     always, count, best = len(plant.nuisance), int(observed.sum()), (np.inf, y)
     for threshold in THRESHOLDS:

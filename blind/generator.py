@@ -3,7 +3,7 @@
 """A second rig simulation, written from docs/simulation.md alone, without ``psd_deflection.model.simulation``."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,9 @@ from blind import law_forms
 
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
-
 RATE = 1000.0
 FINER = 5
 STEP = 1.0 / (RATE * FINER)
-
 EI = 69e9 * math.pi / 4.0 * (0.0159**4 - 0.0138**4)
 GJ = 24e9 * math.pi / 2.0 * (0.0159**4 - 0.0138**4)
 PLACES = ((0.0, 0.070), (-0.100, 0.0))
@@ -89,12 +87,10 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
     f_b, f_t, z_b, z_t = 14.0, 21.0, 0.02, 0.02
     for e in find(effects, 'bending_stiffness'):
         stiff_b *= 1.0 + e['scale']
-        if e.get('moves_frequency'):
-            f_b *= math.sqrt(1.0 + e['scale'])
+        f_b *= math.sqrt(1.0 + e['scale']) if e.get('moves_frequency') else 1.0
     for e in find(effects, 'torsional_stiffness'):
         stiff_t *= 1.0 + e['scale']
-        if e.get('moves_frequency'):
-            f_t *= math.sqrt(1.0 + e['scale'])
+        f_t *= math.sqrt(1.0 + e['scale']) if e.get('moves_frequency') else 1.0
     for e in find(effects, 'damping'):
         z_b, z_t = e['bending_ratio'], e['torsion_ratio']
     give_b = length**3 / (3.0 * stiff_b)
@@ -117,28 +113,18 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
     for e in find(effects, 'law_link'):
         static[:, law_forms.LOADS.index(e['where'])] += e['size'] * law_forms.added(e, known, at, 1.0 / RATE)
     for e in find(effects, 'clamp_friction'):
-        levers = (length, length, 1.0)
-        axes = {1: (0, 1), 2: (2,), 3: (0, 1, 2)}[int(e['axis'])]
-        for axis in axes:
-            half = 0.5 * e['width'] * levers[axis]
-            follower = 0.0
+        for axis in {1: (0, 1), 2: (2,), 3: (0, 1, 2)}[int(e['axis'])]:
+            half, follower = 0.5 * e['width'] * (length, length, 1.0)[axis], 0.0
             for i, x in enumerate(static[:, axis].tolist()):
-                if x - follower > half:
-                    follower = x - half
-                elif follower - x > half:
-                    follower = x + half
-                static[i, axis] = follower
+                static[i, axis] = follower = min(max(follower, x - half), x + half)
     sag = np.zeros(3)
     for e in find(effects, 'self_weight'):
         # Its moment w L^2/2 turns the clamp too.
         clamp = sum(c['compliance'] for c in find(effects, 'clamp_bending_compliance'))
         sag[1] -= e['weight_per_length'] * (length**4 / (8.0 * stiff_b) + clamp * length**3 / 2.0)
-    for e in find(effects, 'tip_force'):
-        sag[0] += e['x'] * give_b
-        sag[1] += e['y'] * give_b
-    for e in find(effects, 'mount_tilt'):
-        sag[0] += e['x'] * length
-        sag[1] += e['y'] * length
+    for name, lever in (('tip_force', give_b), ('mount_tilt', length)):
+        for e in find(effects, name):
+            sag[:2] += e['x'] * lever, e['y'] * lever
     pose = np.empty((len(loads) * FINER, 3))
     creeps = find(effects, 'creep')
     for axis, (frequency, ratio) in enumerate(((f_b, z_b), (f_b, z_b), (f_t, z_t))):
@@ -238,8 +224,7 @@ def _clip_spot(x: Array, radius: float, profile: int) -> tuple[Array, Array]:
     full = np.concatenate(([0.0], np.cumsum(0.5 * step * (weight[1:] + weight[:-1]))))
     first_moment = weight * u
     first = np.concatenate(([0.0], np.cumsum(0.5 * step * (first_moment[1:] + first_moment[:-1]))))
-    hi = np.arccos(-np.clip((half - x) / radius, -1.0, 1.0))
-    lo = np.arccos(-np.clip((-half - x) / radius, -1.0, 1.0))
+    hi, lo = (np.arccos(-np.clip((edge - x) / radius, -1.0, 1.0)) for edge in (half, -half))
     light = np.interp(hi, angle, full) - np.interp(lo, angle, full)
     moment = np.interp(hi, angle, first) - np.interp(lo, angle, first)
     return x + radius * moment / light, light / full[-1]
@@ -290,30 +275,26 @@ def sensors(dots: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> tupl
 
 def _alien_sensors(m: Array, t: Array, warm: Array, effects: Sequence[Spec]) -> None:
     """Effects that are in no catalogue, each on PSD 1 or 2; changes ``m`` in place."""
+    added: dict[str, tuple[int, Callable[[], Array]]] = {
+        'alien_square_crosstalk': (0, lambda: m[:, 1] ** 2),
+        'alien_thermal_square': (3, lambda: warm**2),
+        'alien_rectifier': (2, lambda: np.abs(m[:, 3])),
+        'alien_beat': (1, lambda: np.sin(2 * np.pi * (0.3 + 0.02 * t) * t)),
+    }
+    gains = {'alien_gain_drift': (1, t), 'alien_thermal_gain': (3, warm)}
     for e in effects:
-        size = e.get('size', 0.0)
-        if e['name'] == 'alien_square_crosstalk':
-            m[:, 0] += size * m[:, 1] ** 2
-        elif e['name'] == 'alien_thermal_square':
-            m[:, 3] += size * warm**2
-        elif e['name'] == 'alien_gain_drift':
-            m[:, 1] *= 1.0 + size * t
-        elif e['name'] == 'alien_thermal_gain':
-            m[:, 3] *= 1.0 + size * warm
-        elif e['name'] == 'alien_rectifier':
-            m[:, 2] += size * np.abs(m[:, 3])
-        elif e['name'] == 'alien_walk':
+        name, size = e['name'], e.get('size', 0.0)
+        if name in added:
+            m[:, added[name][0]] += size * added[name][1]()
+        elif name in gains:
+            m[:, gains[name][0]] *= 1.0 + size * gains[name][1]
+        elif name == 'alien_walk':
             steps = np.random.default_rng(int(e['seed'])).normal(size=len(t) // FINER + 1)
             m[:, 0] += size * np.repeat(np.cumsum(steps), FINER)[: len(t)]
-        elif e['name'] == 'alien_backlash':
+        elif name == 'alien_backlash':
             held = m[0, 3]
-            out = np.empty(len(m))
             for i, v in enumerate(m[:, 3].tolist()):
-                held = min(max(held, v - size), v + size)
-                out[i] = held
-            m[:, 3] = out
-        elif e['name'] == 'alien_beat':
-            m[:, 1] += size * np.sin(2 * np.pi * (0.3 + 0.02 * t) * t)
+                m[i, 3] = held = min(max(held, v - size), v + size)
 
 
 def electronics(m: Array, light: Array, t: Array, effects: Sequence[Spec]) -> Array:
@@ -343,12 +324,10 @@ def output(volts: Array, effects: Sequence[Spec], bits: int = 16) -> Array:
     """Clipping, coarse steps, the own steps of a converter of so many bits over +-10 V."""
     v = volts
     for e in find(effects, 'amplifier_saturation'):
-        cols = [0, 1, 2, 3, 4, 5] if e['sums'] else [0, 1, 3, 4]
-        v = v.copy()
+        v, cols = v.copy(), [0, 1, 2, 3, 4, 5] if e['sums'] else [0, 1, 3, 4]
         v[:, cols] = np.clip(v[:, cols], -e['limit'], e['limit'])
     for e in find(effects, 'quantisation'):
-        v = v.copy()
-        cols = [0, 1, 3, 4] if e.get('sums', 1) == 0 else [0, 1, 2, 3, 4, 5]
+        v, cols = v.copy(), [0, 1, 3, 4] if e.get('sums', 1) == 0 else [0, 1, 2, 3, 4, 5]
         v[:, cols] = e['step'] * np.round(v[:, cols] / e['step'])
     lsb = LSB * 2.0 ** (16 - bits)
     half = 2 ** (bits - 1)
@@ -444,13 +423,10 @@ class Generator:
         return output(clean + noise(len(clean), kind, seed) + jitter(clean, effects, seed), effects)
 
 
-LINK = frozenset(
-    (
-        *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
-        *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
-        'tip_force',
-        *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
-        *('law_load', 'law_link'),
-    )
-)
+LINK = {
+    *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
+    *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
+    *('load_offset', 'load_direction', 'alien_cubic_spring', 'alien_quadratic_load', 'alien_soft_mode'),
+    *('law_load', 'law_link', 'tip_force'),
+}
 """Effects that change the motion, and with it the slow part of a run."""

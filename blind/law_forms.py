@@ -3,7 +3,7 @@
 """Laws that no catalogue has, drawn by chance over stage, variable and form; formulas of their own."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,10 @@ from scipy.signal import lfilter
 
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
-
 LOADS = ('load_fx', 'load_fy', 'load_tz')
 DOTS = ('x1', 'y1', 'x2', 'y2')
 FULL = {'load_fx': 30.0, 'load_fy': 50.0, 'load_tz': 29.0, 'temperature': 3.5, **dict.fromkeys(DOTS, 2e-3)}
 """About the largest value of each variable in the experiment, in which the shapes are drawn."""
-
 STATIC = ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'magnitude')
 OF_STAGE: Mapping[str, tuple[str, ...]] = {
     'load': ('square', 'cube', 'stop', 'dead_band', 'saturation', 'product', 'hop', 'events', 'fading_square'),
@@ -29,18 +27,9 @@ OF_STAGE: Mapping[str, tuple[str, ...]] = {
     ),
     'electronics': ('dead_band', 'saturation', 'events', 'gain_events', 'rate', 'fading_square', 'jitter'),
 }
-KIND_OF = {
-    **dict.fromkeys(STATIC, 'static'),
-    'hop': 'switched',
-    'events': 'switched',
-    'gain_events': 'switched',
-    'rate': 'rate',
-    'drag': 'rate',
-    'fading_square': 'history',
-    'stick': 'history',
-    'resonance': 'resonance',
-    'jitter': 'variance',
-}
+KIND_OF = dict.fromkeys(STATIC, 'static') | dict.fromkeys(('hop', 'events', 'gain_events'), 'switched')
+KIND_OF |= dict.fromkeys(('rate', 'drag'), 'rate') | dict.fromkeys(('fading_square', 'stick'), 'history')
+KIND_OF |= {'resonance': 'resonance', 'jitter': 'variance'}
 
 
 def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
@@ -59,7 +48,7 @@ def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
         of = [str(rng.choice([n for n in LOADS if n != where]))]
     if form in ('dead_band', 'saturation', 'jitter') and stage in ('psd', 'electronics'):
         of = [where]
-    if form in ('rate', 'drag') and form == 'rate':
+    if form == 'rate':
         # A delay of one's own reading is in the catalogue.
         of = [DOTS[DOTS.index(where) ^ 1]]
     if form == 'product':
@@ -68,29 +57,17 @@ def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
     if form == 'events':
         of = []
     times = np.sort(rng.uniform(2.0, 22.0, int(rng.integers(1, 5)))).tolist() if 'events' in form else []
-    return {
-        'name': f'law_{stage}',
-        'form': form,
-        'where': where,
-        'of': of,
-        'at': float(rng.uniform(0.15, 0.6)),
-        'sign': float(rng.choice((-1.0, 1.0))),
-        'time_constant': float(np.exp(rng.uniform(math.log(0.2), math.log(4.0)))),
-        'frequency': float(rng.uniform(30.0, 70.0)),
-        'times': [round(t, 3) for t in times],
-    }
+    out: dict[str, Any] = {'name': f'law_{stage}', 'form': form, 'where': where, 'of': of}
+    out |= {'at': float(rng.uniform(0.15, 0.6)), 'sign': float(rng.choice((-1.0, 1.0)))}
+    out['time_constant'] = float(np.exp(rng.uniform(math.log(0.2), math.log(4.0))))
+    return {**out, 'frequency': float(rng.uniform(30.0, 70.0)), 'times': [round(t, 3) for t in times]}
 
 
 def truth_of(law: Spec) -> dict[str, Any]:
     """What an answer must say: stage, what it acts on, variables, kind."""
-    variables = [*law['of'], *(['time'] if law['times'] else [])]
-    return {
-        'stage': law['name'].removeprefix('law_'),
-        'where': law['where'],
-        'variables': sorted(set(variables)),
-        'kind': KIND_OF[law['form']],
-        'form': law['form'],
-    }
+    form, where, variables = law['form'], law['where'], {*law['of'], *(['time'] if law['times'] else [])}
+    of = {'stage': law['name'].removeprefix('law_'), 'where': where, 'variables': sorted(variables)}
+    return {**of, 'kind': KIND_OF[form], 'form': form}
 
 
 def lag(u: Array, tau: float, step: float) -> Array:
@@ -131,41 +108,29 @@ def _between(t: Array, times: Sequence[float]) -> Array:
     return on
 
 
+OF_NOW: Mapping[str, Callable[[Array, float, float], Array]] = {
+    'square': lambda u, b, sign: u**2,
+    'cube': lambda u, b, sign: u**3,
+    'stop': lambda u, b, sign: np.clip(sign * u - b, 0.0, None),
+    'dead_band': lambda u, b, sign: -np.clip(u, -b, b),
+    'saturation': lambda u, b, sign: b * np.tanh(u / b) - u,
+    'magnitude': lambda u, b, sign: np.sqrt(u**2),
+    'hop': lambda u, b, sign: np.where(sign * u > b, 1.0, 0.0),
+    'stick': lambda u, b, sign: _stuck(u, 0.1 * b),
+    'product': lambda u, b, sign: u,
+}
+
+
 def added(law: Spec, known: Mapping[str, Array], t: Array, step: float) -> Array:
     """What the law adds (n,), in units of its size; ``known``: the variables on the grid ``t``."""
     form = law['form']
     scaled = [known[n] / FULL[n] for n in law['of']]
     u = np.prod(scaled, axis=0) if scaled else np.ones(len(t))
-    b, sign = law['at'], law['sign']
-    if form == 'square':
-        out = u**2
-    elif form == 'cube':
-        out = u**3
-    elif form == 'stop':
-        out = np.clip(sign * u - b, 0.0, None)
-    elif form == 'dead_band':
-        out = -np.clip(u, -b, b)
-    elif form == 'saturation':
-        out = b * np.tanh(u / b) - u
-    elif form == 'magnitude':
-        out = np.sqrt(u**2)
-    elif form == 'hop':
-        out = np.where(sign * u > b, 1.0, 0.0)
-    elif form == 'events':
-        out = _between(t, law['times'])
-    elif form == 'gain_events':
-        out = u * _between(t, law['times'])
-    elif form in ('rate', 'drag'):
+    if form in OF_NOW:
+        return np.asarray(OF_NOW[form](u, law['at'], law['sign']))
+    if form in ('events', 'gain_events'):
+        return np.asarray(u * _between(t, law['times']))
+    if form in ('rate', 'drag'):
         speed = np.gradient(u, step)
-        out = speed * np.abs(speed) if form == 'drag' else speed
-    elif form == 'fading_square':
-        out = lag(u**2, law['time_constant'], step)
-    elif form == 'stick':
-        out = _stuck(u, 0.1 * b)
-    elif form == 'resonance':
-        out = _mode(u, law['frequency'], step)
-    elif form == 'product':
-        out = u
-    else:
-        raise ValueError(form)
-    return np.asarray(out)
+        return np.asarray(speed * np.abs(speed) if form == 'drag' else speed)
+    return lag(u**2, law['time_constant'], step) if form == 'fading_square' else _mode(u, law['frequency'], step)

@@ -20,7 +20,6 @@ from blind.cases import designs, gap_of
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
 
 _BANK = SignatureBank()
@@ -83,9 +82,8 @@ def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
     return [Observation('recording', load_rig(), volts, g.loads, g.temperature)]
 
 
-def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
-    discovery = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
-    return discovery.tree(), discovery
+def answer(law: dict[str, Any] | None, seed: int) -> dict[str, Any]:
+    return discover(observe(law, seed), load_rig(), seed=0, bank=_BANK).tree()
 
 
 def evaluated(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
@@ -120,9 +118,8 @@ def evaluated(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]
 
 def _reported_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
     """Return whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
-    message = sorted(
-        f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == f'psd_{law["where"][-1]}'
-    )
+    where = f'psd_{law["where"][-1]}'
+    message = sorted(f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == where)
     jumps = law['form'] == 'events' and law['where'] in law_forms.DOTS and len(message) == len(law['times'])
     return jumps and bool(np.allclose(message, law['times'], atol=0.01))
 
@@ -145,9 +142,8 @@ def _reported_as_note(law: dict[str, Any], got: dict[str, Any]) -> bool:
 def _answer_to_law(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
     law, seed = job
     start = time.perf_counter()
-    got, _ = answer(None if law is None else sized(law), seed)
-    row = evaluated(law if law is None else sized(law), got)
-    return {**row, 'number': seed, 'seconds': time.perf_counter() - start}
+    law = None if law is None else sized(law)
+    return {**evaluated(law, answer(law, seed)), 'number': seed, 'seconds': time.perf_counter() - start}
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
@@ -169,13 +165,10 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
     unwanted = f'{alarms}/{len(nulls)} (wanted 0)'
     lines.append(bound_line(alarms == 0, f'laws where nothing is missing: {unwanted}'))
     if laws:
-        lines.append(
-            f'     right kind: {sum(r["kind"] for r in laws)}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}'
-        )
-        jumps, notes = sum(r['jumps'] for r in laws), sum(r['note'] for r in laws)
-        lines.append(
-            f'     of these told as jumps of a PSD: {jumps}/{n}; as another load under which alone it acts: {notes}/{n}'
-        )
+        kinds, jumps, notes = (sum(r[name] for r in laws) for name in ('kind', 'jumps', 'note'))
+        lines.append(f'     right kind: {kinds}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}')
+        alone = f'as another load under which alone it acts: {notes}/{n}'
+        lines.append(f'     of these told as jumps of a PSD: {jumps}/{n}; {alone}')
         lines.append(f'     seconds a law: median {np.median([r["seconds"] for r in laws]):.0f}')
     return '\n'.join(lines), passed
 

@@ -124,10 +124,8 @@ class Emps(Plant):
             after = np.sign(free) * np.maximum(np.abs(free) - gain * coulomb, 0.0)
             q = q + 0.5 * h * (v + after)
             v = after
-        observed = out[:: KEPT // STEP].T * (1.0 + _of(model, 'position_gain', 'scale')) + _of(
-            model, 'position_offset', 'shift'
-        )
-        return [row[None, :] for row in observed]
+        gain, shift = 1.0 + _of(model, 'position_gain', 'scale'), _of(model, 'position_offset', 'shift')
+        return [row[None, :] for row in out[:: KEPT // STEP].T * gain + shift]
 
 
 ARCSECONDS = 3600.0 * 180.0 / np.pi
@@ -213,7 +211,6 @@ class AuxTel(Plant):
 
 EI = 91.0  # N m^2, fitted by those who measured.
 READING = 5e-4  # m rms, of a ruler with millimetres.
-
 STIFFNESS = plant_effect(
     'bending_compliance',
     EffectParameter('scale', '', -0.9, 3.0, 0.1, 'relative change of 1/EI'),
@@ -272,9 +269,8 @@ class Boom(Plant):
             at = length + _of(model, 'root_length', 'longer')
             moment = (force + cap) * at + 0.5 * weight * at**2
             bent = give * ((force + cap) * at**3 / 3.0 + weight * at**4 / 8.0)
-            return np.asarray(
-                bent + (_of(model, 'clamp_compliance', 'compliance') * moment + _of(model, 'mount_tilt', 'angle')) * at
-            )
+            angle = _of(model, 'clamp_compliance', 'compliance') * moment + _of(model, 'mount_tilt', 'angle')
+            return np.asarray(bent + angle * at)
 
         start = tip(self.lengths[:1], np.zeros(1))
         return [(tip(r[:, 0], r[:, 1]) - start)[None, :] for r in self._rows]

@@ -76,9 +76,8 @@ def dots(rig: Mapping[str, float], pose: Array) -> Array:
     tip = np.column_stack((pose[:, :2], np.full(n, LENGTH)))
     out = np.empty((n, 4))
     for i, (fx, fy) in enumerate(generator.PLACES):
-        channel = {
-            name.partition('.')[2]: v for name, v in rig.items() if name.startswith((f'psd_{i + 1}.', f'beam_{i + 1}.'))
-        }
+        mine = f'psd_{i + 1}.', f'beam_{i + 1}.'
+        channel = {name.partition('.')[2]: v for name, v in rig.items() if name.startswith(mine)}
         along = np.array([math.tan(channel['angle_x']), math.tan(channel['angle_y']), 1.0])
         start = np.array([fx + channel['x'], fy + channel['y'], LENGTH + channel['height']])
         origin = tip + rotation @ np.array([channel['center_x'], channel['center_y'], channel['height']])
@@ -120,11 +119,8 @@ class Light(NamedTuple):
         """x, y and sum, V, with a laser of so much light that alone would read ``x``, ``y`` V."""
         total = laser + self.level
         share = self.level / total
-        return (
-            x + share * (self.x - x) + self.offset_x,
-            y + share * (self.y - y) + self.offset_y,
-            np.full(len(x), total + self.offset_sum),
-        )
+        moved = x + share * (self.x - x) + self.offset_x, y + share * (self.y - y) + self.offset_y
+        return *moved, np.full(len(x), total + self.offset_sum)
 
 
 DARK = Light(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -134,11 +130,8 @@ def draw_light(rng: np.random.Generator) -> tuple[Light, Light]:
     """On both PSDs: 1 to 4 % of the light, anywhere within 2 mm; offsets of 10 mV, of the sum 5 mV (1 sd)."""
 
     def random_light() -> Light:
-        return Light(
-            float(rng.uniform(0.05, 0.2)),
-            *rng.uniform(-4.0, 4.0, 2).tolist(),
-            *rng.normal(0.0, (0.010, 0.010, 0.005)).tolist(),
-        )
+        level, place = float(rng.uniform(0.05, 0.2)), rng.uniform(-4.0, 4.0, 2).tolist()
+        return Light(level, *place, *rng.normal(0.0, (0.010, 0.010, 0.005)).tolist())
 
     return random_light(), random_light()
 
@@ -188,10 +181,8 @@ def record(
     ``sigma``: V, of all channels or of each (6,). ``light``: besides that of the lasers."""
     read = dots(rig, pose) / generator.MM_PER_V
     both = (DARK, DARK) if light is None else light
-    columns = [
-        column for i, side in enumerate(both) for column in side.measured(LASER, read[:, 2 * i], read[:, 2 * i + 1])
-    ]
-    volts = np.column_stack(columns) + rng.normal(0.0, sigma, (len(pose), 6))
+    sides = (side.measured(LASER, read[:, 2 * i], read[:, 2 * i + 1]) for i, side in enumerate(both))
+    volts = np.column_stack([column for side in sides for column in side]) + rng.normal(0.0, sigma, (len(pose), 6))
     frames = np.arange(17, len(pose) - 17, every)
     reference = pose[frames] + rng.normal(size=(len(frames), 3)) * reference_sd
     wrong = rng.random(len(frames)) < outliers

@@ -13,7 +13,6 @@ from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import Rig, replace_values
 
 LENGTH = 0.585  # m, of the rig file.
-
 AXES = {1: [1, 0, 2, 3, 4, 5], 2: [0, 1, 2, 4, 3, 5]}
 Make = Callable[[float, Observation, np.random.Generator], list[Observation]]
 
@@ -50,12 +49,10 @@ def _zero(size: float, o: Observation, rng: np.random.Generator) -> list[Observa
     half = len(o.volts) // 2
     first = dataclasses.replace(o, name='first', volts=o.volts[:half], loads=o.loads[:half])
     rest = dataclasses.replace(o, name='second', volts=o.volts[half:] + shift, loads=o.loads[half:])
+    parts = [first, rest]
     if o.temperature is None:
-        return [first, rest]
-    return [
-        dataclasses.replace(first, temperature=np.full(half, 21.0)),
-        dataclasses.replace(rest, temperature=np.full(len(rest.volts), 21.0)),
-    ]
+        return parts
+    return [dataclasses.replace(part, temperature=np.full(len(part.volts), 21.0)) for part in parts]
 
 
 def _coverage(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:

@@ -35,8 +35,7 @@ def rung(link: Link, rng: np.random.Generator, seconds: float = 10.0, steps: int
     weight = float(rng.uniform(0.5e-3, 3e-3)) if equal else math.nan
     for i, start in enumerate(np.sort(rng.uniform(0.2, seconds - 2.0, steps))):
         size = float(rng.uniform(0.5e-3, 3e-3)) * float(rng.choice([-1.0, 1.0]))
-        if equal:
-            size = weight * (-1.0) ** i
+        size = weight * (-1.0) ** i if equal else size
         since = np.clip(t - start, 0.0, None)
         moved = np.ones(len(t))
         for hertz, zeta, share in link.modes:
@@ -145,10 +144,9 @@ def scored(seeds: Iterable[int], case: Case) -> Score:
 def report(name: str, score: Score) -> str:
     f, z = np.abs(score.frequency), np.abs(score.damping)
     held = [f'{100.0 * share:.1f} % inside' for share in np.mean(score.inside, axis=0)]
-    return (
-        f'{name:30} frequency {100 * np.median(f):.4f} % median, {100 * f.max():.4f} % at most, {held[0]}; '
-        f'damping {100 * np.median(z):.2f} %, {100 * z.max():.2f} %, {held[1]}; missed {score.missed}'
-    )
+    frequency = f'{100 * np.median(f):.4f} % median, {100 * f.max():.4f} % at most, {held[0]}'
+    damping = f'{100 * np.median(z):.2f} %, {100 * z.max():.2f} %, {held[1]}'
+    return f'{name:30} frequency {frequency}; damping {damping}; missed {score.missed}'
 
 
 def main() -> None:

@@ -284,17 +284,8 @@ def evaluate(run: Run, rig: Rig, late: int = 0) -> Result:
             later = meanwhile.predicted(np.array([UNSEEN / RATE]))
             unseen[block] = (later.pose[0] - run.pose[at]) / np.sqrt(later.variance[0])
     part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)
-    return Result(
-        velocity[part],
-        velocity_sd[part],
-        _smoothed(run, part),
-        squares[part],
-        predicted[samples],
-        held[samples],
-        pose[part],
-        pose_sd[part],
-        unseen[part],
-    )
+    first_four = velocity[part], velocity_sd[part], _smoothed(run, part), squares[part]
+    return Result(*first_four, predicted[samples], held[samples], pose[part], pose_sd[part], unseen[part])
 
 
 @dataclass(frozen=True)
@@ -346,19 +337,16 @@ def by_frequency(results: Iterable[Result]) -> list[float]:
 
 
 def table(by_kind: Mapping[str, list[Figures]]) -> str:
-    rows = [
-        '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | predicted | held |',
-        '|---' * 10 + '|',
-    ]
+    rows = ['| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | predicted | held |']
+    rows.append('|---' * 10 + '|')
     for kind, axes in by_kind.items():
         for name, f in zip(AXES, axes, strict=True):
             unit, micro = ('mm/s', 'µm') if name != 'theta' else ('mrad/s', 'µrad')
             ratio = f.velocity / f.velocity_sd
-            rows.append(
-                f'| {kind} | {name} | {f.velocity * 1e3:.3f} {unit} | {f.velocity_sd * 1e3:.3f} | {ratio:.2f} '
-                f'| {f.velocity / f.smoothed:.3f} | {f.nis:.3f} | {f.inside:.1%} '
-                f'| {f.predicted * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
-            )
+            cells = [f'{f.velocity * 1e3:.3f} {unit}', f'{f.velocity_sd * 1e3:.3f}', f'{ratio:.2f}']
+            cells += [f'{f.velocity / f.smoothed:.3f}', f'{f.nis:.3f}', f'{f.inside:.1%}']
+            errors = f'{f.predicted * 1e6:.1f} {micro} | {f.held * 1e6:.1f} |'
+            rows.append(' | '.join([f'| {kind}', name, *cells, errors]))
     return '\n'.join(rows)
 
 
@@ -374,16 +362,12 @@ def main() -> None:
     evaluated: dict[str, list[Result]] = {}
     for kind in args.kinds:
         seeds = range(args.seed, args.seed + args.runs)
-        evaluated[kind] = [
-            evaluate(biased(make(kind, args.seconds, seed), args.bias), rig_of(), args.late)
-            for seed in watched(seeds, kind)
-        ]
+        runs = (biased(make(kind, args.seconds, seed), args.bias) for seed in watched(seeds, kind))
+        evaluated[kind] = [evaluate(run, rig_of(), args.late) for run in runs]
     print(table({kind: figures(results) for kind, results in evaluated.items()}))
     if 'chirp' in evaluated:
-        print(
-            'predicted / held at its worst up to the mode: '
-            + ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, by_frequency(evaluated['chirp']), strict=True))
-        )
+        ratios = ', '.join(f'{a} {r:.2f}' for a, r in zip(AXES, by_frequency(evaluated['chirp']), strict=True))
+        print(f'predicted / held at its worst up to the mode: {ratios}')
     for kind, results in evaluated.items():
         unseen = np.concatenate([r.unseen for r in results])
         inside = np.mean(np.abs(unseen[np.isfinite(unseen[:, 0])]) < 3.0, axis=0)

@@ -16,7 +16,7 @@ from blind.generator import Array, Generator
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.experiment import Limits, proposals
+from psd_deflection.studies.discover.experiment import Limits, Setting, proposals
 from psd_deflection.studies.discover.loop import run_loop
 from psd_deflection.studies.discover.planning import Plan
 
@@ -33,13 +33,8 @@ def first_recordings() -> dict[str, tuple[Array, Array]]:
         return np.repeat(np.array([(0, 0, 0), *levels, (0, 0, 0)], dtype=np.float64), 1500, axis=0)
 
     weights = held((0, -10, -5.85), (0, -30, -17.55), (0, -50, -29.25), (0, 0, 0), (0, -30, 0), (0, -50, 0))
-    designs = {
-        'one weight': held((0, -30, 0)),
-        'sidebar': held((0, -30, -17.55)),
-        'torque': held((0, 0, 20)),
-        'sideways': held((30, 0, 0)),
-    }
-    even = {name: (loads, np.full(len(loads), 21.0)) for name, loads in designs.items()}
+    single = {'one weight': (0, -30, 0), 'sidebar': (0, -30, -17.55), 'torque': (0, 0, 20), 'sideways': (30, 0, 0)}
+    even = {name: (loads := held(load), np.full(len(loads), 21.0)) for name, load in single.items()}
     warming = np.linspace(21.0, 24.0, len(weights))
     return {**even, 'rest, warming': (np.zeros_like(weights), warming), 'weights, warming': (weights, warming)}
 
@@ -77,35 +72,25 @@ def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
     made: list[Observation] = []
     alternatives: list[list[str]] = []
 
+    def measured(setting: Setting, loads: Array, seed: int, name: str) -> Observation:
+        length = float(str(setting.changes.get('link.length', RIG.link.length)))
+        return observed([hidden], loads, setting.temperature(len(loads)), length, seed, name)
+
     def record(plan: Plan, number: int) -> Observation:
         alternatives.append(sorted({t.alternative for t in plan.discriminations}))
-        length = float(str(plan.setting.changes.get('link.length', RIG.link.length)))
-        warm = plan.setting.temperature(len(plan.loads))
-        made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
+        made.append(measured(plan.setting, plan.loads, seed + number, f'next {number}'))
         return made[-1]
 
     done = run_loop([first], lambda known: discover(known, RIG), record, most=MOST)
     named = [*(e.active.effect.name for e in done.discovery.effects), *(f.name for f in done.discovery.setup)]
     together = sorted(done.discovery.unsettled)
-    row |= {
-        'outcome': done.outcome,
-        'recordings': len(done.plans),
-        'named': named,
-        'together': together,
-        'left': alternatives,
-        'planned': [p.words for p in done.plans],
-        'verdict': done.discovery.verdict,
-        'right': named == [name] or (done.outcome != 'unique' and name in (*named, *together)),
-    }
-    confounded = bool(done.plans) or done.outcome != 'unique'
-    row['kind'] = 'confounded' if confounded else 'alone'
+    row |= {'outcome': done.outcome, 'recordings': len(done.plans), 'named': named, 'together': together}
+    row |= {'left': alternatives, 'planned': [p.words for p in done.plans], 'verdict': done.discovery.verdict}
+    row['right'] = named == [name] or (done.outcome != 'unique' and name in (*named, *together))
+    row['kind'] = 'confounded' if done.plans or done.outcome != 'unique' else 'alone'
     if done.outcome == 'limits':
-        more = []
-        for i, p in enumerate(proposals(RIG, Limits())):
-            length = float(str(p.setting.changes.get('link.length', RIG.link.length)))
-            script = p.piece.loads(1000.0)
-            warm = p.setting.temperature(len(script))
-            more.append(observed([hidden], script, warm, length, seed + 100 + i, f'all {i}'))
+        every = enumerate(proposals(RIG, Limits()))
+        more = [measured(p.setting, p.piece.loads(1000.0), seed + 100 + i, f'all {i}') for i, p in every]
         best = discover([first, *made, *more], RIG)
         row['separable'] = [e.active.effect.name for e in best.effects] == [name] and not best.unsettled
     row['seconds'] = time.perf_counter() - start
@@ -125,10 +110,7 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         more = '' if r['outcome'] != 'limits' else ', separable' if r['separable'] else ', nor would all together'
         wrong = '' if r['right'] else ' WRONG'
         lines.append(f'{words}; {r["outcome"]} after {r["recordings"]}{more}{wrong}')
-        lines += [
-            f'    {" | ".join(alternatives)}: {words}'
-            for alternatives, words in zip(r['left'], r['planned'], strict=True)
-        ]
+        lines += [f'    {" | ".join(a)}: {words}' for a, words in zip(r['left'], r['planned'], strict=True)]
     alone = [r for r in rows if r['kind'] == 'alone']
     unseen = sum(r['kind'] == 'hidden' for r in rows)
     lines.append(f'{len(rows)} recordings; {unseen} cannot show their effect')

@@ -59,15 +59,8 @@ NUMBERS = {'sidebar_right_50N': '5.12-5.14', 'sidebar_right_30N': '5.15-5.17', '
 NUMBERS |= {'link_50N': '5.21-5.26', 'link_30N': '5.27-5.29'}
 CALM = 1.0  # s at the end of a recording in which the link rests under its weight.
 STEMS = ('before', 'after')
-RIGS = {
-    'before': 'exact',
-    'before_sidebar': 'wls',
-    'before_link': 'wls',
-    'after': 'exact',
-    'after_sidebar': 'wls',
-    'after_link': 'wls',
-    'one_side': 'exact',
-}
+RIGS = {f'{stem}{place}': 'wls' if place else 'exact' for stem in STEMS for place in ('', '_sidebar', '_link')}
+RIGS['one_side'] = 'exact'
 """Rig files, and the method that the summary has of each. ``one_side``: calibrated by the right side alone."""
 
 
@@ -76,6 +69,11 @@ class Curves(NamedTuple):
 
     t: Array
     poses: Mapping[str, Array]
+
+
+Drawn = Mapping[str, Mapping[str, Curves]]
+Cameras = Mapping[str, Mapping[str, Array]]
+Answers = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -149,13 +147,9 @@ def bench(folder: Path, plan: Plan) -> Bench:
     )
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(NOMINAL, folder / 'nominal.yaml')
-    camera = {
-        'target.spacing': scene.spacing,
-        'target.radius': scene.radius,
-        'camera.matrix': scene.matrix,
-        'camera.distortion': list(scene.distortion),
-    }
-    (folder / 'camera.yaml').write_text(yaml.safe_dump(camera))
+    camera = {'camera.matrix': scene.matrix, 'camera.distortion': list(scene.distortion)}
+    target = {'target.spacing': scene.spacing, 'target.radius': scene.radius}
+    (folder / 'camera.yaml').write_text(yaml.safe_dump(target | camera))
     return Bench(plan, folder, truth, scene, rng)
 
 
@@ -252,12 +246,8 @@ def evaluated(made: Bench, load_case: HeldLoad, stem: str, source: str) -> Any:
 
 def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
     references = itertools.chain.from_iterable(('--reference', f'{h.name}_camera.csv') for h in runs)
-    message = made.run(
-        'calibrate',
-        *(f'{h.name}.csv' for h in runs),
-        *references,
-        *('--exposure', str(made.plan.exposure), '--params-file', 'nominal.yaml', '--out', f'{stem}_found', '--quiet'),
-    )
+    words = ('--exposure', str(made.plan.exposure), '--params-file', 'nominal.yaml', '--quiet')
+    message = made.run('calibrate', *(f'{h.name}.csv' for h in runs), *references, *words, '--out', f'{stem}_found')
     shutil.copy(made.folder / f'{stem}_found' / 'rig.yaml', made.folder / f'{stem}.yaml')
     rig_files(made, stem, {})
     return message
@@ -307,7 +297,7 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
     return summary
 
 
-def _summary(made: Bench, link: Sequence[HeldLoad], answers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _summary(made: Bench, link: Sequence[HeldLoad], answers: Answers) -> dict[str, Any]:
     """Largest errors of ``exact`` on the link, as shares of the deflection at 50 N, by rig file and judge."""
     at = [motion(replace(made.plan, rest=0.0, held=5.0), HeldLoad(50.0, side))[-1] for side in (0, 1)]
     across, twist = float(np.hypot(*at[0][:2])), float(abs(at[1][2]))
@@ -319,18 +309,13 @@ def _summary(made: Bench, link: Sequence[HeldLoad], answers: Mapping[str, Mappin
         }
         for stem, solver in RIGS.items()
     }
-    clock = answers[link[0].name]['after camera']['offset']
-    return {
-        'seed': made.plan.seed,
-        'deflection': {'across': across, 'twist': twist},
-        'limit': made.plan.limit,
-        'shares': shares,
-        'clock': {'true': -CLOCK, 'value': clock['value'], 'interval': clock['interval']},
-        'holds': all(v <= made.plan.limit for v in shares['after'].values()),
-    }
+    clock, limit = answers[link[0].name]['after camera']['offset'], made.plan.limit
+    out = {'seed': made.plan.seed, 'deflection': {'across': across, 'twist': twist}, 'limit': limit, 'shares': shares}
+    out['clock'] = {'true': -CLOCK, 'value': clock['value'], 'interval': clock['interval']}
+    return {**out, 'holds': all(v <= limit for v in shares['after'].values())}
 
 
-def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: Mapping[str, Mapping[str, Any]]) -> str:
+def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: Answers) -> str:
     scale = {axis: summary['deflection']['twist' if axis == 'theta' else 'across'] for axis in SYMBOLS}
     rows = []
     for words, stem in (('rig file', 'before'), ('calibrated', 'after')):
@@ -354,7 +339,7 @@ def relative_errors(curves: Curves, camera: Mapping[str, Array]) -> dict[str, Ar
     return {method: poses[late].mean(axis=0) / reference - 1.0 for method, poses in curves.poses.items()}
 
 
-def _table_51(name: str, drawn: Mapping[str, Mapping[str, Curves]], cameras: Mapping[str, Mapping[str, Array]]) -> str:
+def _table_51(name: str, drawn: Drawn, cameras: Cameras) -> str:
     methods = ('wls_sidebar', 'wls', 'iterative', 'exact')
     errors = {stem: relative_errors(curves, cameras[name]) for stem, curves in drawn[name].items()}
     rows = []
@@ -371,23 +356,14 @@ def _over_time(words: str, two: Mapping[str, Curves], camera: Mapping[str, Array
     for stem, curves in two.items():
         rig = {'before': 'rig file', 'after': 'calibrated'}[stem]
         for name, column, label, factor in SHOWN:
-            series = [
-                Series(STYLES[m][0], curves.t, factor * curves.poses[m][:, column], STYLES[m][1])
-                for m in STYLES
-                if on_link or m != 'wls_link'
-            ]
+            styles = {m: style for m, style in STYLES.items() if on_link or m != 'wls_link'}
+            series = [Series(s[0], curves.t, factor * curves.poses[m][:, column], s[1]) for m, s in styles.items()]
             series.append(Series('camera', camera['t'], factor * camera[name], 'text', 'points'))
             panels.append(Panel(series, 'time / s', f'{rig}: {label}', height=SMALL))
     return Chart(f'{words}: camera and methods over time', panels, beside=3)
 
 
-def _body(
-    made: Bench,
-    summary: Mapping[str, Any],
-    drawn: Mapping[str, Mapping[str, Curves]],
-    cameras: Mapping[str, Mapping[str, Array]],
-    answers: Mapping[str, Mapping[str, Any]],
-) -> Iterator[str]:
+def _body(made: Bench, summary: Mapping[str, Any], drawn: Drawn, cameras: Cameras, answers: Answers) -> Iterator[str]:
     largest = f'sidebar_right_{made.plan.forces[0]:.0f}N'
     code = base64.b64encode((made.folder / f'{largest}.png').read_bytes()).decode()
     words = ', '.join(f'{symbol} {100 * summary["shares"]["after"][axis]:.3f} %' for axis, symbol in SYMBOLS.items())
@@ -411,9 +387,8 @@ def _body(
         yield f'<h3>{title}</h3>'
         yield drawn_chart(_over_time(title, two, cameras[name], name.startswith('link')))
     yield '<h2>What was hidden</h2>'
-    yield table_of(
-        ('parameter', 'true value, SI units'), [(name, f'{value:+.5g}') for name, value in made.truth.items()]
-    )
+    rows = [(name, f'{value:+.5g}') for name, value in made.truth.items()]
+    yield table_of(('parameter', 'true value, SI units'), rows)
     yield '<h2>What calibrate says</h2>' + ''.join(f'<p>{html.escape(line)}</p>' for line in summary['calibrate'])
     lines = html.escape('\n'.join(dict.fromkeys(made.typed)))
     yield f'<h2>Commands</h2><pre role="group" tabindex="0" aria-label="commands">{lines}</pre>'
@@ -431,9 +406,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stem, axes in summary['shares'].items():
         words = ', '.join(f'{axis} {100.0 * share:.3f} %' for axis, share in axes.items())
         print(f'{stem:15s} largest error on the link: {words}')
-    answer = 'within' if summary['holds'] else 'BEYOND'
-    text = f'{answer} {100.0 * summary["limit"]:g} % after calibration; see {args.out / "page.html"}'
-    return conclude(text, summary['holds'])
+    limit = f'{"within" if summary["holds"] else "BEYOND"} {100.0 * summary["limit"]:g} %'
+    return conclude(f'{limit} after calibration; see {args.out / "page.html"}', summary['holds'])
 
 
 if __name__ == '__main__':

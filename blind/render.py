@@ -105,11 +105,7 @@ def rays(
     """Rays x and y (rows, columns) of the pixels in ``box`` (left, top, right, bottom), and d (x, y) / d (u, v)."""
     v, u = np.mgrid[box[1] : box[3], box[0] : box[2]].astype(float)
     x, y = undistort((u - centre[0]) / focal, (v - centre[1]) / focal, distortion)
-    return (
-        x,
-        y,
-        np.stack([np.gradient(x, axis=1), np.gradient(x, axis=0), np.gradient(y, axis=1), np.gradient(y, axis=0)]),
-    )
+    return x, y, np.stack([np.gradient(of, axis=axis) for of in (x, y) for axis in (1, 0)])
 
 
 def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array]:
@@ -178,14 +174,10 @@ def cover(out: Array, scene: Scene, pose: Pose, parts: int) -> None:
 
 def cut(scene: Scene) -> Scene:
     """Return the same scene by a camera whose pixels are smaller."""
-    return replace(
-        scene,
-        width=CUTS * scene.width,
-        height=CUTS * scene.height,
-        focal=CUTS * scene.focal,
-        centre=(CUTS * scene.centre[0] + (CUTS - 1) / 2, CUTS * scene.centre[1] + (CUTS - 1) / 2),
-        hide=[(CUTS * a, CUTS * b, CUTS * c, CUTS * d) for a, b, c, d in scene.hide],
-    )
+    x, y = (CUTS * c + (CUTS - 1) / 2 for c in scene.centre)
+    hide = [(CUTS * a, CUTS * b, CUTS * c, CUTS * d) for a, b, c, d in scene.hide]
+    size = {name: CUTS * getattr(scene, name) for name in ('width', 'height', 'focal')}
+    return replace(scene, centre=(x, y), hide=hide, **size)
 
 
 def together(fine: Array, scene: Scene) -> Array:
@@ -264,8 +256,5 @@ def over_exposure(motion: Callable[[float], Pose], t: float, exposure: float, in
 
 
 def mean_of(poses: Sequence[Pose]) -> tuple[float, float, float]:
-    return (
-        float(np.mean([p.dx for p in poses])),
-        float(np.mean([p.dy for p in poses])),
-        float(np.mean([p.theta for p in poses])),
-    )
+    dx, dy, theta = (float(np.mean([getattr(p, name) for p in poses])) for name in ('dx', 'dy', 'theta'))
+    return dx, dy, theta

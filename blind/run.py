@@ -17,7 +17,7 @@ from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, possible, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.recordings.observation import Observation
-from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.screen import SignatureBank
@@ -64,24 +64,19 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
     # A mistake may change the rig, the loads or the length of the recording.
     bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
     observed = observe(case, truth)
-    discovery = discover(observed, _rig(case, observed), seed=0, without=case.without, bank=bank)
+    rig = observed[0].rig if case.mistake[0] else load_rig()
+    discovery = discover(observed, rig, seed=0, without=case.without, bank=bank)
     return discovery.tree(), discovery
-
-
-def _rig(case: Case, observed: Sequence[Observation]) -> Rig:
-    return observed[0].rig if case.mistake[0] else load_rig()
 
 
 def _answer_case(job: tuple[Case, Path]) -> None:
     case, folder = job
     path = folder / 'answers' / f'{case.key}.json'
-    if path.exists():
-        return
-    truth = json.loads((folder / 'sealed' / path.name).read_text())['truth']
-    start = time.perf_counter()
-    got, _ = answer(case, truth)
-    got['seconds'] = time.perf_counter() - start
-    _write(path, json.dumps(got))
+    if not path.exists():
+        truth = json.loads((folder / 'sealed' / path.name).read_text())['truth']
+        start = time.perf_counter()
+        got, _ = answer(case, truth)
+        _write(path, json.dumps({**got, 'seconds': time.perf_counter() - start}))
 
 
 def _write(path: Path, text: str) -> None:
@@ -93,12 +88,10 @@ def _write(path: Path, text: str) -> None:
 
 def _sealed(given: tuple[Case, Path]) -> None:
     case, path = given
-    if path.exists():
-        return
-    sealed = {'case': dataclasses.asdict(case), 'truth': truth_of(case)}
-    if case.kind == 'hand':
-        sealed['wrong'] = byhand.drawn(case.design).wrong
-    _write(path, json.dumps(sealed, sort_keys=True))
+    if not path.exists():
+        sealed = {'case': dataclasses.asdict(case), 'truth': truth_of(case)}
+        wrong = {'wrong': byhand.drawn(case.design).wrong} if case.kind == 'hand' else {}
+        _write(path, json.dumps(sealed | wrong, sort_keys=True))
 
 
 def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:

@@ -48,16 +48,9 @@ def complete(answer: dict[str, Any]) -> dict[str, Any]:
     unknown = [{'law': None, **u} for u in answer.get('unknown', ())]
     message = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
     nan = math.nan
-    return {
-        'verdict': message,
-        'setup': [],
-        'remaining': {'floors': nan},
-        'gap': {'before': nan, 'after': nan, 'floor': nan, 'heldout_after': nan},
-        'provenance': {'forward_simulations': 0},
-        **answer,
-        'effects': effects,
-        'unknown': unknown,
-    }
+    gap = dict.fromkeys(('before', 'after', 'floor', 'heldout_after'), nan)
+    usual = {'verdict': message, 'setup': [], 'remaining': {'floors': nan}, 'gap': gap}
+    return {**usual, 'provenance': {'forward_simulations': 0}, **answer, 'effects': effects, 'unknown': unknown}
 
 
 def load(folder: Path, keys: Sequence[str]) -> list[Row]:
@@ -92,16 +85,11 @@ def covered(row: Row) -> list[tuple[str, bool]]:
             # With other choices it is another effect, whose parameters are not those of the truth.
             if any(k in t and isinstance(v, int) and int(t[k]) != v for k, v in fitted.items()):
                 continue
+            known = {f'amplitude_{c}': v for c, v in zip(CHANNELS, t.get('amplitude', ()), strict=False)} | t
             for name, value in fitted.items():
-                if not isinstance(value, dict) or value['sd'] <= 0.0:
-                    continue
-                if name in t:
-                    true = float(t[name])
-                elif name.startswith('amplitude_') and 'amplitude' in t:
-                    true = float(t['amplitude'][CHANNELS.index(name.removeprefix('amplitude_'))])
-                else:
-                    continue
-                out.append((f'{row.key}:{name}', abs(value['value'] - true) <= 1.96 * value['sd']))
+                if isinstance(value, dict) and value['sd'] > 0.0 and name in known:
+                    inside = abs(value['value'] - float(known[name])) <= 1.96 * value['sd']
+                    out.append((f'{row.key}:{name}', inside))
     return out
 
 
@@ -161,8 +149,8 @@ def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
     hit = [bool(r.sets) and r.truth[0]['name'] in r.sets[0] for r in single]
     sheet.rate('truth named first or in its set, gap >= 3 floors', single, hit, wanted, 1.0, True)
     if single:
-        size, most = float(np.mean([len(r.sets[0]) if r.sets else 1 for r in single])), THRESHOLDS['mean_set_size']
-        sheet.check(size <= most, f'mean size of that set: {size:.2f}, wanted <= {most}')
+        size, most = np.mean([len(r.sets[0]) if r.sets else 1 for r in single]), THRESHOLDS['mean_set_size']
+        sheet.check(bool(size <= most), f'mean size of that set: {size:.2f}, wanted <= {most}')
     apart = [r for r in single if r.separated]
     first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]
     wanted = THRESHOLDS['named_first_where_separated']
@@ -186,9 +174,8 @@ def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
         sheet.rate(f'{" or ".join(kinds)} called unknown', of, right, THRESHOLDS['unknown'], 1.0, len(kinds) == 1)
     listed = [r for r in rows if r.kind in ('single', 'pair') and r.gap >= 3.0]
     wrongly = [r for r in listed if r.answer['verdict'] == 'unknown_effect']
-    sheet.lines.append(
-        f'        truth in the library, gap >= 3 floors, and yet something called unknown: {len(wrongly)}/{len(listed)}'
-    )
+    words = 'truth in the library, gap >= 3 floors, and yet something called unknown'
+    sheet.lines.append(f'        {words}: {len(wrongly)}/{len(listed)}')
     sheet.lines += [f'          {r.key}: {_row_words(r)}' for r in wrongly]
 
 

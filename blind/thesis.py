@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from blind.campaign import conclude, options
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import catalogue
-from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.model.solvers import solver_from_rig
@@ -57,12 +57,10 @@ def table_b1() -> list[str]:
         effect = catalogue()[name]
         off = effect.off_values(Physics.of(rig), next(iter(effect.variants())))
 
-        def apart(
-            size: float, gap: int = gap, off: dict[str, float] = off, of: str = name, p: str = parameter
-        ) -> float:
-            return figures([ActiveEffect(catalogue()[of], {**off, p: size})])[gap] - (BENDING, TWIST)[gap]
+        def apart(size: float, gap: int, effect: Effect, off: dict[str, float], parameter: str) -> float:
+            return figures([ActiveEffect(effect, {**off, parameter: size})])[gap] - (BENDING, TWIST)[gap]
 
-        size = float(brentq(apart, low, high, xtol=1e-9))
+        size = float(brentq(apart, low, high, (gap, effect, off, parameter), 1e-9))
         lines.append(f'  {("bending", "twist")[gap]} closes with {name}.{parameter} {size:.4g}')
     return lines
 

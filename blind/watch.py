@@ -114,9 +114,8 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
     solver = solver_from_rig('exact', rig)
     compliance = Pipeline(rig).tip_loads.compliance
     watch = Watch(rig, compliance)
-    loads = np.repeat(
-        np.array([LEVELS[i % len(LEVELS)] for i in range(HOLDS)], dtype=np.float64), HOLD_S * RATE, axis=0
-    )
+    levels = np.array([LEVELS[i % len(LEVELS)] for i in range(HOLDS)], dtype=np.float64)
+    loads = np.repeat(levels, HOLD_S * RATE, axis=0)
     clean = Generator(loads, np.full(len(loads), 20.0), LENGTH).clean([])[:, [0, 1, 3, 4]] * MM_PER_V
     clean = clean.reshape(-1, BLOCK, 4).mean(axis=1)
     noise = FITTED * SIGMA * MM_PER_V / math.sqrt(BLOCK)
@@ -163,10 +162,8 @@ def table(runs: Sequence[Run], hours: float, alarms: int, message: Sequence[str]
         early = sum(r.early for r in of)
         met = met and len(observed) >= WANTED * len(of) and not early
         after = np.array([r.after for r in observed] or [math.nan])
-        lines.append(
-            f'{kind} of {SIZES[kind]}: seen within {WITHIN_S:g} s in {len(observed)} of {len(of)}, after '
-            f'{np.median(after):.1f} s in the middle, {after.max():.1f} s at most; {early} alarms before it'
-        )
+        when = f'after {np.median(after):.1f} s in the middle, {after.max():.1f} s at most; {early} alarms before it'
+        lines.append(f'{kind} of {SIZES[kind]}: seen within {WITHIN_S:g} s in {len(observed)} of {len(of)}, {when}')
     if hours:
         lines.append(f'{hours:.2f} quiet hours: {alarms} alarms; {1e6 * cost:.1f} us a block')
         lines += [f'    {words}' for words in message[:20]]
@@ -182,13 +179,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs = [(kind, args.first + i) for i in range(args.runs) for kind in SIZES]
     parts = [(args.hours / args.jobs, args.first + i) for i in range(args.jobs)] if args.hours else []
     runs = list(over(watch_run, jobs, args.jobs, 'events'))
-    hours, alarms, costs = 0.0, 0, list[float]()
-    message: list[str] = []
-    for done, count, words, cost in over(quiet, parts, args.jobs, 'quiet hours'):
-        hours, alarms = hours + done, alarms + count
-        message += words
-        costs.append(cost)
-    return conclude(*table(runs, hours, alarms, message, float(np.mean(costs)) if costs else 0.0))
+    silence = list(over(quiet, parts, args.jobs, 'quiet hours'))
+    message = [words for _, _, of, _ in silence for words in of]
+    cost = float(np.mean([cost for *_, cost in silence])) if silence else 0.0
+    return conclude(*table(runs, sum(s[0] for s in silence), sum(s[1] for s in silence), message, cost))
 
 
 if __name__ == '__main__':

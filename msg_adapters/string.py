@@ -11,9 +11,7 @@ from msg_adapters.message_type import MessageType
 from psd_deflection.records import Mark, RigState
 
 MESSAGE = MessageType(
-    'std_msgs/msg/String',
-    'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18',
-    'string data\n',
+    'std_msgs/msg/String', 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18', 'string data\n'
 )
 
 MAX_CHARACTERS = 16_000_000

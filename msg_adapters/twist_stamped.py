@@ -19,8 +19,5 @@ def from_motion(m: TipMotion) -> Fields:
     """Fields of a motion: linear x, y and angular z."""
     return {
         'header': header(m.t_ns, FRAME),
-        'twist': {
-            'linear': {'x': m.vx, 'y': m.vy, 'z': 0.0},
-            'angular': {'x': 0.0, 'y': 0.0, 'z': m.vtheta},
-        },
+        'twist': {'linear': {'x': m.vx, 'y': m.vy, 'z': 0.0}, 'angular': {'x': 0.0, 'y': 0.0, 'z': m.vtheta}},
     }

@@ -22,10 +22,7 @@ def from_load(load: TipLoad | AppliedLoad) -> Fields:
     """Fields of an estimated or a known load: force x, y and torque z."""
     return {
         'header': header(load.t_ns, FRAME),
-        'wrench': {
-            'force': {'x': load.fx, 'y': load.fy, 'z': 0.0},
-            'torque': {'x': 0.0, 'y': 0.0, 'z': load.tz},
-        },
+        'wrench': {'force': {'x': load.fx, 'y': load.fy, 'z': 0.0}, 'torque': {'x': 0.0, 'y': 0.0, 'z': load.tz}},
     }
 
 

@@ -265,8 +265,8 @@ def identify(recording: Recording | str | Path, rig: Rig | str | Path | None = N
     ``recording`` with knocks or releases, and ``rig``: as for :func:`check`. ``save`` writes ``rig.yaml`` too.
     Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
     """
-    from psd_deflection.studies.identify.from_recordings import read_identify
     from psd_deflection.studies.identify.identify import identify as of_problem
+    from psd_deflection.studies.identify.identify import read_identify
     from psd_deflection.studies.study import opened
 
     return of_problem(read_identify(opened(recording, rig)))
@@ -287,7 +287,7 @@ def watch(recording: Recording | str | Path, rig: Rig | str | Path | None = None
     from psd_deflection.recordings.replay.engine import rig_at_start, warnings_about_rig
     from psd_deflection.rig.config import Rig
     from psd_deflection.studies.study import Opened
-    from psd_deflection.studies.watch.from_recordings import watch as of_recording
+    from psd_deflection.studies.watch.result import watch as of_recording
 
     given = recording if isinstance(recording, Recording) else open(recording)
     known = rig_at_start(given) if rig is None else _rig(rig)
@@ -318,7 +318,7 @@ def validate(
     Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
     """
     from psd_deflection.studies.study import opened
-    from psd_deflection.studies.validate.from_recordings import read_validate
+    from psd_deflection.studies.validate.validate import read_validate
     from psd_deflection.studies.validate.validate import validate as of_problem
 
     known = opened(recording, rig)

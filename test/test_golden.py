@@ -16,7 +16,6 @@ from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 
 BAGS = Path(__file__).parent.parent / 'bags'
-
 LOST = {45, 46, 200, *range(1003, 1030), *range(2000, 2145), 3999}
 WITHOUT_ESTIMATE = {
     'clean': {},

@@ -18,7 +18,6 @@ from psd_deflection.ros import topics as table
 from psd_deflection.ros.topics import BASE, SERVICES
 
 pytestmark = pytest.mark.slow
-
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / 'config'
 

@@ -16,8 +16,8 @@ from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.formats.format import open_sink
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import (
     MOST_PSDS,
     BlockStatus,
@@ -35,7 +35,6 @@ from test.streams import spots as spots_of
 
 Counts = npt.NDArray[np.int32]
 Spoil = Callable[[Counts], None]
-
 THREE = Path(__file__).parents[1] / 'config' / 'three_psds.yaml'
 LEVEL = {'psd_1.height': 0.0, 'psd_2.height': 0.0}
 FOURTH = {'psd_4.center': [-0.06, -0.06], 'psd_4.height': -0.04}

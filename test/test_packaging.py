@@ -22,10 +22,8 @@ from tools.release import TREE
 ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
-
 TESTED_ELSEWHERE = {'records'}
 """A room without tests of its own: it declares only."""
-
 EXECUTABLES = (
     *('estimator', 'replay', 'simulate', 'discover', 'calibrate', 'camera'),
     *('validate', 'check', 'identify', 'compensator', 'effects'),
@@ -85,9 +83,7 @@ def test_the_version_is_the_same_everywhere() -> None:
 
 KEYS = {'ruamel': 'python3-ruamel.yaml'}
 """Imported name to rosdep key. The key of any other is ``python3-NAME``."""
-
 ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
-
 UNNAMED = {
     **dict.fromkeys(('cobs', 'mcap', 'mcap_ros2'), 'frames, files and messages as judges; from PyPI'),
     'cyclonedds': 'another DDS as judge; not in rosdep',
@@ -97,7 +93,6 @@ UNNAMED = {
     **dict.fromkeys(('psd_deflection', 'msg_adapters', 'test', 'tools', 'bench', 'blind'), 'ours'),
 }
 """What the sources import and no list of dependencies names."""
-
 IMPORTED_AS = {'opencv-python-headless': 'cv2', 'rerun-sdk': 'rerun', 'pyserial': 'serial', 'PyYAML': 'yaml'}
 
 

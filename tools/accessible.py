@@ -18,18 +18,10 @@ from tools.program import WAIT_S
 
 VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390, 844, True), ('dark', 390, 844, True))
 """Colour scheme, width, height, whether it is a phone."""
+RUN = Path(__file__).with_suffix('.js').read_text(encoding='utf-8')
 
-RUN = """
-const done = arguments[arguments.length - 1];
-// Colours on their way to others are not those that a person sees.
-for (const way of document.getAnimations()) if (way.effect.getComputedTiming().endTime !== Infinity) way.finish();
-axe.run(document, {resultTypes: ['violations']}).then(
-  (found) => done(found.violations.map(
-    (v) => [v.id, v.help, v.nodes.map((n) => [n.target.join(' '), n.failureSummary])],
-  )),
-  (error) => done([['axe', String(error), []]]),
-);
-"""
+
+READY = 'return document.readyState === "complete"'
 
 
 @functools.cache
@@ -66,13 +58,11 @@ def main() -> int:
     parser.add_argument('site', type=Path)
     parser.add_argument('--in-turn', action='store_true', help='each page in one view only, a quarter of the time')
     args = parser.parse_args()
-    site = args.site
-    pages = sorted(str(p.relative_to(site)) for p in site.rglob('*.html'))
+    pages = sorted(str(p.relative_to(args.site)) for p in args.site.rglob('*.html'))
     if not pages:
-        raise SystemExit(f'{site}: no pages are there')
-
+        raise SystemExit(f'{args.site}: no pages are there')
     failures = 0
-    with tempfile.TemporaryDirectory() as profile, served(site) as address:
+    with tempfile.TemporaryDirectory() as profile, served(args.site) as address:
         driver = open_browser(Path(profile))
         try:
             for number, view in enumerate(views(driver)):
@@ -81,9 +71,7 @@ def main() -> int:
                 driver.execute_script('localStorage.clear()')
                 for page in pages[number :: len(VIEWS)] if args.in_turn else pages:
                     driver.get(f'{address}/{page}')
-                    WebDriverWait(driver, WAIT_S).until(
-                        lambda d: d.execute_script('return document.readyState') == 'complete'
-                    )
+                    WebDriverWait(driver, WAIT_S).until(lambda d: d.execute_script(READY))
                     for line in violations(driver):
                         failures += 1
                         print(f'{page} ({view}): {line}', flush=True)

@@ -14,7 +14,6 @@ class AllowContract(Contract):
     """Libraries that rooms may import."""
 
     type_name = 'allow'
-
     pure = fields.ListField(subfield=fields.StringField())
     rooms = fields.ListField(subfield=fields.StringField())
 
@@ -43,11 +42,8 @@ def ours(module: str) -> bool:
 
 def imported(graph: ImportGraph) -> dict[str, set[str]]:
     """Each module of the program with the libraries that it imports itself."""
-    return {
-        module: {m for m in graph.find_modules_directly_imported_by(module) if not ours(m)}
-        for module in sorted(graph.modules)
-        if ours(module)
-    }
+    modules = filter(ours, sorted(graph.modules))
+    return {module: {m for m in graph.find_modules_directly_imported_by(module) if not ours(m)} for module in modules}
 
 
 def broken_by(imports: Mapping[str, set[str]], pure: set[str], lines: Mapping[str, list[str]]) -> list[str]:

@@ -22,50 +22,15 @@ CANNOT = {
     r'^ *ros2 bag info ': 'rosbag2_py is C++, which no registry has',
 }
 """Lines that are reported instead of run."""
-
-APT = r"""#!/bin/bash
-words=()
-for word in "$@"; do
-  case $word in
-    ros-*) echo "/opt/ros stands in for $word"
-      if dpkg-query -W "$word" >/dev/null 2>&1; then continue; fi
-      : >"/var/lib/dpkg/info/$word.list"
-      printf 'Package: %s\nStatus: install ok installed\nVersion: 1\nArchitecture: all\n' "$word" >>/var/lib/dpkg/status
-      printf 'Maintainer: none\nDescription: none\n\n' >>/var/lib/dpkg/status;;
-    python3-colcon-common-extensions) words+=(colcon python3-colcon-{bash,defaults,library-path,notification,output} \
-      python3-colcon-{package-information,package-selection,parallel-executor,recursive-crawl,ros,test-result});;
-    *) words+=("$word");;
-  esac
-done
-exec /usr/bin/apt-get "${words[@]}"
-"""
-"""apt-get that passes over what Debian has not."""
-
-SETUP = """
-export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3 AMENT_PREFIX_PATH=/opt/ros/jazzy
-export PATH=/opt/ros/jazzy/bin:$PATH PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3.*/site-packages)
-export LD_LIBRARY_PATH=/opt/ros/jazzy/lib:$(printf '%s:' /opt/ros/jazzy/lib/python3.*/site-packages/*.libs)
-"""
-CATALOGUE = """<catalog xmlns="urn:oasis:names:tc:entity:xmlns:xml:catalog">
-<rewriteURI uriStartString="http://download.ros.org/schema/" rewritePrefix="file:///opt/ros/jazzy/share/schema/"/>
-</catalog>
-"""
+FILES = ROOT / 'packaging/apt_job'
 STAND_INS = {
-    'opt/ros/jazzy/setup.bash': SETUP,
+    'opt/ros/jazzy/setup.bash': (FILES / 'setup.bash').read_text(),
     'opt/ros/jazzy/lib/tf2_ros/static_transform_publisher': '#!/bin/sh\necho publishing nothing\nexec sleep infinity\n',
     'opt/ros/jazzy/share/ament_index/resource_index/packages/tf2_ros': '',
-    'etc/xml/catalog': CATALOGUE,
-    'usr/local/bin/apt-get': APT,
+    'etc/xml/catalog': (FILES / 'catalog').read_text(),
+    'usr/local/bin/apt-get': (FILES / 'apt-get').read_text(),
 }
-IMAGE = """
-apt-get update -qq
-apt-get install -qq --no-install-recommends build-essential ca-certificates git libxml2-utils \
-    python3-{argcomplete,dev,empy,importlib-metadata,lark,netifaces,osrf-pycommon,pip,psutil,rosdep2,venv}
-python3 -m pip install --quiet --break-system-packages -c /opt/ubuntu-24.04.txt \
-    numpy scipy pandas pyserial PyYAML ruamel.yaml tqdm zstandard aiohttp jsonschema==4.10.3 setuptools==68.1.2 \
-    hypothesis==6.98.15 pytest==7.4.4 pytest-xdist==3.4.0 pytest-timeout==2.2.0
-"""
-"""What the image of ROS has, and the versions of Ubuntu 24.04 over those of Debian."""
+IMAGE = (FILES / 'image.sh').read_text()
 
 
 def ready(chroot: Path, ros: Path, rosdistro: Path) -> dict[str, str]:

@@ -17,7 +17,7 @@ from psd_deflection.run.session import Session
 from tools.program import Program
 
 COMMAND = [
-    *('qemu-system-arm', '-machine', 'mps2-an385', '-display', 'none', '-monitor', 'none', '-chardev', 'pty,id=uart'),
+    *('qemu-system-arm', '-machine', 'mps2-an385', '-display', 'none', '-monitor', 'none', '-chardev', 'pty,id=uart')
 ]
 PATIENCE_S = 60.0
 
@@ -119,11 +119,10 @@ def main() -> int:
     finally:
         qemu.end()
     counters = session.acquisition.counters
-    print(
-        f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {counters.lost} lost '
-        f'({counters.device_overruns} dropped by the device), {checked.wrong} wrong, {bad + counters.bad} bad frames, '
-        f'{counters.restarts} restarts, skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms'
-    )
+    lost = f'{counters.lost} lost ({counters.device_overruns} dropped by the device)'
+    print(f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {lost},', end=' ')
+    print(f'{checked.wrong} wrong, {bad + counters.bad} bad frames, {counters.restarts} restarts,', end=' ')
+    print(f'skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms')
     # On a busy host the device in qemu drops samples: those sent and those reported as dropped must make up the time.
     enough = checked.enough.is_set() and checked.samples + counters.lost >= 0.95 * 1000 * checked.span_s
     enough = enough and checked.samples > 1000

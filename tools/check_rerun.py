@@ -72,10 +72,8 @@ def check_poses(written: Written, recording: Recording) -> int:
     for i, (name, _, _, scale, _) in enumerate(POSE):
         times, counts, values = written.rows(f'tip/{name}', 'Scalars:scalars')
         need(bool((np.diff(times) > 0).all()), f'{name}: times do not rise')
-        need(
-            np.array_equal(times[counts == 1], series.t_ns),
-            f'{name}: {len(values)} values, {len(series.t_ns)} estimates',
-        )
+        words = f'{name}: {len(values)} values, {len(series.t_ns)} estimates'
+        need(np.array_equal(times[counts == 1], series.t_ns), words)
         # Another machine's last bits may differ.
         need(np.allclose(values, series.pose[:, i] * scale, rtol=1e-9, atol=1e-9), f'{name} differs')
         empty = times[counts == 0]
@@ -91,8 +89,7 @@ def check_poses(written: Written, recording: Recording) -> int:
 
 def picture(files: list[Path], target: Path) -> bool:
     """Take a picture of ``files`` in the viewer on a virtual screen; False if that is not possible."""
-    missing = shutil.which('xvfb-run') is None or not list(Path('/usr/share/vulkan/icd.d').glob('*.json'))
-    if missing:
+    if shutil.which('xvfb-run') is None or not list(Path('/usr/share/vulkan/icd.d').glob('*.json')):
         print('no picture: it needs xvfb-run and a Vulkan driver (apt install xvfb mesa-vulkan-drivers)')
         return False
     target.unlink(missing_ok=True)
@@ -126,7 +123,6 @@ def main() -> int:
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='where the .rrd go')
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    target = Path()
     for path in args.recordings:
         target = args.out / f'{path.stem}.rrd'
         target.unlink(missing_ok=True)
@@ -134,10 +130,8 @@ def main() -> int:
         subprocess.run([BIN / 'psd-deflection', 'convert', path, '--out', target], check=True)
         seconds = time.monotonic() - began
         subprocess.run([BIN / 'rerun', 'rrd', 'verify', target], check=True, capture_output=True)
-        recording, written = psd_deflection.open(path), Written(target)
-        breaks = check_poses(written, recording)
-        size = target.stat().st_size
-        print(f'  as recorded: poses and bands; {breaks} breaks; {size} bytes, {seconds:.1f} s')
+        breaks = check_poses(Written(target), psd_deflection.open(path))
+        print(f'  as recorded: poses and bands; {breaks} breaks; {target.stat().st_size} bytes, {seconds:.1f} s')
     shot = args.out / 'shot.png'
     if picture([target], shot):
         check_picture(shot)

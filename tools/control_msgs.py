@@ -126,9 +126,8 @@ def _compile(work: Path, package: str) -> Path:
 
     prefix, out = Path(sys.prefix), work / KINDS[-1] / package
     (out / '__init__.py').touch()
-    include = [work / kind for kind in KINDS]
-    include += [Path(sysconfig.get_path('include')), Path(np.get_include()), prefix / 'include']
-    include += [path for path in (prefix / 'include').iterdir() if path.is_dir()]
+    include = [*(work / kind for kind in KINDS), Path(sysconfig.get_path('include')), Path(np.get_include())]
+    include += [prefix / 'include', *(path for path in (prefix / 'include').iterdir() if path.is_dir())]
     flags = ['-O0', '-fPIC', *(f'-I{path}' for path in include)]
     files = [(kind, file) for kind in KINDS for file in (work / kind).rglob('*.c*')]
 

@@ -12,15 +12,8 @@ HEADER = '{copyright}\nSPDX-License-Identifier: Apache-2.0'
 
 def licences() -> dict[str, object]:
     """Those of ament_copyright and ours, in the shape of its older and of its newer versions."""
-    ours = SimpleNamespace(
-        name='Apache-2.0 by SPDX',
-        file_header=HEADER,
-        file_headers=[HEADER],
-        license_file='',
-        license_files=[],
-        contributing_file='',
-        contributing_files=[],
-    )
+    none = {**dict.fromkeys(('license_file', 'contributing_file'), ''), 'license_files': [], 'contributing_files': []}
+    ours = SimpleNamespace(name='Apache-2.0 by SPDX', file_header=HEADER, file_headers=[HEADER], **none)
     return {**get_licenses(), 'spdx_apache2': ours}
 
 

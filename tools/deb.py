@@ -13,40 +13,18 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-from tools.release import ROOT, changelog_rst
+from tools.program import ROOT, copy_checkout
+from tools.release import changelog_rst
 from tools.rosdistro import our_rows, prepared
 
 PAGE = re.compile(r'http://127\.0\.0\.1:\d+/')
 LONGEST = 3600.0  # s: longer than this nobody waits for a step on a busy machine; an idle one needs a minute or two.
-
-ENTER = """
-mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc" && mount --bind /tmp "$1/tmp" || exit 1
-cp /etc/resolv.conf /etc/hosts "$1/etc"
-mkdir -p "$1/etc/ssl" && cp /etc/ssl/certs/ca-certificates.crt "$1/etc/ssl/ours.crt"
-exec env -i HOME=/root TERM=dumb LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive PIP_CERT=/etc/ssl/ours.crt \\
-    PATH=/usr/sbin:/usr/bin:/sbin:/bin chroot "$1" sh -ec "$2"
-"""
-"""A shell in the chroot; its mounts end with it. In /tmp lie the locks by which the tests share the domains of ROS."""
-
+ENTER, BUILD = ((ROOT / 'packaging/deb' / name).read_text() for name in ('enter.sh', 'build.sh'))
 PIP = 'apt-get install -qq --no-install-recommends python3-venv >/dev/null 2>&1'
-BUILDERS = 'dpkg-dev build-essential debhelper dh-python python3-all python3-setuptools equivs'
-BUILD = f"""
-apt-get install -qq --no-install-recommends {BUILDERS} >/dev/null 2>&1
-cd /root/deb && DEB_BUILD_OPTIONS=nocheck DEB_BUILD_PROFILES=nocheck dpkg-buildpackage -b -us -uc >../build.log 2>&1 \\
-    || {{ tail -n 20 ../build.log; exit 1; }}
-cd /root
-names=$(dpkg-deb -f ros-jazzy-psd-deflection_*.deb Depends | tr , '\\n' | grep -o 'ros-[a-z0-9-]*' | paste -sd,)
-printf 'Package: stand-in-for-ros\\nVersion: 1\\nProvides: %s\\nDescription: nothing\\n' "$names" >control
-equivs-build control >/dev/null 2>&1
-"""
-INSTALL = (
-    'cd /root && apt-get install -qq --no-install-recommends ./stand-in*.deb ./ros-jazzy-*.deb '
-    'python3-zstandard python3-aiohttp >/dev/null 2>&1'
-)
-START = (
-    'cd /root && PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3*/site-packages) '
-    'exec /opt/ros/jazzy/bin/psd-deflection monitor'
-)
+OF_APT = './stand-in*.deb ./ros-jazzy-*.deb python3-zstandard python3-aiohttp'
+INSTALL = f'cd /root && apt-get install -qq --no-install-recommends {OF_APT} >/dev/null 2>&1'
+JAZZY = '/opt/ros/jazzy'
+START = f'cd /root && PYTHONPATH=$(echo {JAZZY}/lib/python3*/site-packages) exec {JAZZY}/bin/psd-deflection monitor'
 LEFT = (
     'the tests of the package in its build (nocheck): Debian has no ROS',
     'the node of ROS: its packages are stood in for; the workflow runs it with those of apt',
@@ -62,23 +40,17 @@ def one_line(root: Path) -> str:
     return match[0]
 
 
-def tree(root: Path, folder: Path) -> Path:
+def tree(folder: Path) -> Path:
     """What git has of the checkout, copied into ``folder``, with the changelog that bloom reads."""
-    names = subprocess.run(['git', 'ls-files', '-z'], cwd=root, check=True, capture_output=True, text=True).stdout
-    for name in filter(None, names.split('\0')):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(root / name, folder / name)
-    (folder / 'CHANGELOG.rst').write_text(changelog_rst(root))
+    (copy_checkout(folder) / 'CHANGELOG.rst').write_text(changelog_rst(ROOT))
     return folder
 
 
 def templates(folder: Path, env: dict[str, str], system: str, version: str) -> list[str]:
     """Fills ``folder/debian`` as bloom does, and returns what it warns of. Raises RuntimeError if it rejects."""
     words = f'bloom-generate rosdebian --os-name {system} --os-version {version} --ros-distro jazzy .'
-    pipe, none = subprocess.PIPE, subprocess.DEVNULL
-    done = subprocess.run(
-        words.split(), cwd=folder, env=env, stdin=none, stdout=pipe, stderr=pipe, text=True, check=False
-    )
+    none = subprocess.DEVNULL
+    done = subprocess.run(words.split(), cwd=folder, env=env, stdin=none, capture_output=True, text=True, check=False)
     message = re.sub(r'\x1b\[\d*m', '', done.stdout + done.stderr)
     if done.returncode or not (folder / 'debian/control').is_file():
         raise RuntimeError(f'bloom rejects the package for {version}:\n{message}')
@@ -140,14 +112,14 @@ def main(argv: list[str] | None = None) -> int:
     shutil.rmtree(work / 'made', ignore_errors=True)
     env = prepared(options.rosdistro, options.tools, work / 'made/rosdistro', our_rows(ROOT))
     for system, version in (('debian', 'bookworm'), ('ubuntu', 'noble')):
-        warned = templates(tree(ROOT, work / 'made' / version), env, system, version)
+        warned = templates(tree(work / 'made' / version), env, system, version)
         print(f'bloom, {version}: ' + ('; '.join(warned) or 'no warning'))
     chroot = work / options.suite
     if not (chroot / 'etc/debian_version').is_file():
         command = ['debootstrap', '--variant=minbase', options.suite, chroot]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     shutil.rmtree(chroot / 'root', ignore_errors=True)
-    tree(ROOT, chroot / 'root/checkout')
+    tree(chroot / 'root/checkout')
     shutil.copytree(work / 'made/noble', chroot / 'root/deb')
     print(f'load of this machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores')
     ready = seconds_of(chroot, 'apt-get update -qq && ' + PIP)

@@ -144,24 +144,10 @@ def reported_live(path: Path) -> str:
     for records in replayed(recording, pipeline):
         for block in (record for record in records if isinstance(record, SampleBlock)):
             spectrum.add(block)
-    count = pipeline.counters
-    new = CounterSnapshot(
-        0,
-        count.samples,
-        0,
-        0,
-        0,
-        count.blocks,
-        count.estimates,
-        count.degraded,
-        pipeline.estimator.contradictions,
-        0,
-        0,
-    )
-    entries = [
-        estimates_entry(pipeline, new, 'unknown'),
-        *(laser_entry(pipeline, psd) for psd in range(1, len(rig.psds) + 1)),
-    ]
+    c, contradictions = pipeline.counters, pipeline.estimator.contradictions
+    new = CounterSnapshot(0, c.samples, 0, 0, 0, c.blocks, c.estimates, c.degraded, contradictions, 0, 0)
+    lasers = (laser_entry(pipeline, psd) for psd in range(1, len(rig.psds) + 1))
+    entries = [estimates_entry(pipeline, new, 'unknown'), *lasers]
     line = line_entry(rig, spectrum.frequencies, spectrum.density())
     entries += [line] if line.level > OK else []
     wrong = [entry for entry in entries if entry.level > OK]
@@ -213,10 +199,8 @@ def section(case: Case, message: str) -> str:
 
 
 def page(message: dict[str, str]) -> str:
-    parts = [
-        '# Gallery\n\nA good rig and typical faults: the recording, the first lines of the output (… marks a cut), and '
-        'the remedy. `make docs STEP=gallery` makes this page; the tests compare it.\n'
-    ]
+    head = 'A good rig and typical faults: the recording, the first lines of the output (… marks a cut), and the remedy'
+    parts = [f'# Gallery\n\n{head}. `make docs STEP=gallery` makes this page; the tests compare it.\n']
     for name, study in STUDIES.items():
         parts.append(f'## {study.title}\n\n{study.about}\n')
         parts += [section(case, message[case.name]) for case in CASES if case.study == name and case.name in message]
@@ -238,17 +222,10 @@ def same(now: str, before: str) -> bool:
         return False
     for a, b in zip(NUMBER.finditer(now), NUMBER.finditer(before), strict=True):
         x, y = (float(match[0].replace('−', '-')) for match in (a, b))
-        digit = max(_last_digit(match) for match in (a, b))
+        digit = max(10.0 ** (int(m[2] or 0) - len(m[1] or '')) if m[1] or m[2] else 0.0 for m in (a, b))
         if abs(x - y) > 0.05 * max(abs(x), abs(y)) + 2.0 * digit:
             return False
     return True
-
-
-def _last_digit(match: re.Match[str]) -> float:
-    """What one in the last digit of a number is; 0 of a whole number."""
-    if match[1] is None and match[2] is None:
-        return 0.0
-    return 10.0 ** (int(match[2] or 0) - len(match[1] or ''))
 
 
 def shown(case: Case, renew: bool) -> str:

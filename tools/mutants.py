@@ -27,8 +27,6 @@ EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
 NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
 """Broken files that a test has noticed, "DIGEST STAGE" a line: only what was not is tried again. Delete it to begin
 anew."""
-
-
 OPERATORS = (
     *('NumberReplacer', 'AddNot', 'ReplaceAndWithOr', 'ReplaceOrWithAnd', 'ReplaceTrueWithFalse'),
     *('ReplaceFalseWithTrue', 'ReplaceBreakWithContinue', 'ReplaceContinueWithBreak', 'ZeroIterationForLoop'),
@@ -146,16 +144,12 @@ def tried(
     are drawn; None: those made by hand. The slow tests, if they are asked (``slow``), do not try what is ``known`` to
     change no answer. Raises RuntimeError if the tests fail without."""
     room = ROOMS[name]
-    lines = NOTICED.read_text().splitlines() if NOTICED.exists() else []
-    noticed = dict(line.split(' ') for line in lines)
+    noticed = dict(line.split(' ') for line in (NOTICED.read_text().splitlines() if NOTICED.exists() else ()))
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_checkout(Path(scratch))
         remaining: list[Mutant | HandMade] = [*(of_room(room) if seed is None else drawn(folder, room, count, seed))]
-        stages = [
-            (stage, tests)
-            for stage, tests in zip(STAGES, (room.tests, room.slow if slow else ()), strict=True)
-            if tests
-        ]
+        every = zip(STAGES, (room.tests, room.slow if slow else ()), strict=True)
+        stages = [(stage, tests) for stage, tests in every if tests]
         for stage, tests in stages:
             if not remaining:
                 break
@@ -164,8 +158,7 @@ def tried(
                 for mutant in these:
                     file = folder / mutant.file
                     text = file.read_text()
-                    code = mutant.code(text)
-                    words = mutant.words(text)
+                    code, words = mutant.code(text), mutant.words(text)
                     line = mutant.line if isinstance(mutant, Mutant) else mutant.line_of(text)
                     key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
                     observed = noticed.get(key, '')
@@ -206,10 +199,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     known = equivalent()
     good = True
-    print(
-        '| room | mutants | equivalent | noticed: quick | slow | of those that count |\n|---|---|---|---|---|---|',
-        flush=True,
-    )
+    print('| room | mutants | equivalent | noticed: quick | slow | of those that count |')
+    print('|---|---|---|---|---|---|', flush=True)
     unnoticed: list[str] = []
     for name in arguments.rooms:
         same, survived, noticed = 0, 0, dict.fromkeys(STAGES, 0)

@@ -19,17 +19,14 @@ from tools.program import ROOT
 
 OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection/model/simulation/effects').glob('[a-z]*.py')}
 """Not those of the person who writes the pages."""
-
-
 _CHANNEL = re.compile(r'_(?:x|y|sum)\d$')
 
 
 def topics() -> str:
     """A row for each topic, or for those of several PSDs or solvers, and one for each action."""
     heard = (rows[0] for rows in HEARD.values())
-    actions = [
-        f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.description} |' for a in SERVED.values()
-    ]
+    kinds = ((a, a.type.split('/')[-1]) for a in SERVED.values())
+    actions = [f'| `{a.name}` (action) | {kind} | {a.node} | | {a.description} |' for a, kind in kinds]
     return _table('topic | type | node | QoS | ', [*_rows(PUBLISHED.values(), ''), *_rows(heard, ' (in)'), *actions])
 
 
@@ -67,9 +64,8 @@ def _effect(effect: Effect) -> str:
 
 
 def _table(head: str, rows: Iterable[str]) -> str:
-    return '\n'.join(
-        [f'| {head}|' if head.endswith(' ') else f'| {head} |', '|---' * (head.count('|') + 1) + '|', *rows]
-    )
+    first = f'| {head}|' if head.endswith(' ') else f'| {head} |'
+    return '\n'.join([first, '|---' * (head.count('|') + 1) + '|', *rows])
 
 
 def _rows(rows: Iterable[GraphTopic], direction: str) -> Iterator[str]:
@@ -86,15 +82,8 @@ def _qos(delivery: Delivery) -> str:
     return f'{delivery.depth}{reliable}{", latched" if delivery.latched else ""}'
 
 
-TABLES = {
-    'topics': topics,
-    'commands': commands,
-    'exit statuses': exit_statuses,
-    'parameters': parameters,
-    'effects': effects,
-}
+TABLES = {f.__name__.replace('_', ' '): f for f in (topics, commands, exit_statuses, parameters, effects)}
 PAGES = tuple(ROOT / 'docs' / name for name in ('topics.md', 'commands.md', 'effects.md'))
-
 MOST_WORDS = 45_000
 
 

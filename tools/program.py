@@ -19,7 +19,6 @@ from pathlib import Path
 
 WAIT_S = 240.0
 """Longest wait for what is expected: with ten busy loops on two cores it may come a hundred times as late as alone."""
-
 ROOT = Path(__file__).resolve().parent.parent
 PSD_DEFLECTION = (sys.executable, '-m', 'psd_deflection')  # How our own program is started in this environment.
 
@@ -50,29 +49,22 @@ def ros_domain() -> Iterator[int]:
     raise RuntimeError('no ROS domain is free')
 
 
+Words = Sequence[str]
+Env = Mapping[str, str] | None
+
+
 class Program:
     """``command`` in a new session, without input; stdout and stderr are read together. ``terminal``: it writes to a
     terminal; otherwise into a pipe. ``wait_s`` limits each wait."""
 
     def __init__(
-        self,
-        command: Sequence[str],
-        cwd: Path = ROOT,
-        *,
-        terminal: bool = False,
-        env: Mapping[str, str] | None = None,
-        wait_s: float = WAIT_S,
+        self, command: Words, cwd: Path = ROOT, *, terminal: bool = False, env: Env = None, wait_s: float = WAIT_S
     ) -> None:
         self._wait_s = wait_s
         self._fd, theirs = pty.openpty() if terminal else os.pipe()
+        nothing, ours = subprocess.DEVNULL, {**os.environ, 'PYTHONUNBUFFERED': '1', **(env or {})}
         self.process = subprocess.Popen(
-            command,
-            cwd=cwd,
-            stdin=subprocess.DEVNULL,
-            stdout=theirs,
-            stderr=theirs,
-            start_new_session=True,
-            env={**os.environ, 'PYTHONUNBUFFERED': '1', **(env or {})},
+            command, cwd=cwd, stdin=nothing, stdout=theirs, stderr=theirs, start_new_session=True, env=ours
         )
         os.close(theirs)
         self._output = b''

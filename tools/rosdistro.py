@@ -18,7 +18,6 @@ from tools.release import ROOT, rosdep_table
 
 SYSTEMS = {'noble': ('ubuntu', 'jazzy'), 'resolute': ('ubuntu', 'lyrical'), 'bookworm': ('debian', 'jazzy')}
 """Columns of the table: the system, and the distribution of ROS whose packages it has."""
-
 LOOK_UP = """
 import json, sys
 from rosdep2.installers import InstallerContext
@@ -81,13 +80,9 @@ def written(rosdistro: Path, into: Path, ours: str = '', root: Path = Path('/'))
 
 def prepared(rosdistro: Path, tools: Path, into: Path, ours: str = '') -> dict[str, str]:
     """The environment with which rosdep and bloom on this machine read what ``written`` writes."""
-    env = {
-        **os.environ,
-        **written(rosdistro, into, ours),
-        'HOME': str(into),
-        'ROS_HOME': str(into / 'ros'),
-        'PATH': f'{(tools / "bin").absolute()}{os.pathsep}{os.environ["PATH"]}',
-    }
+    path = f'{(tools / "bin").absolute()}{os.pathsep}{os.environ["PATH"]}'
+    homes = {'HOME': str(into), 'ROS_HOME': str(into / 'ros')}
+    env = {**os.environ, **written(rosdistro, into, ours), **homes, 'PATH': path}
     subprocess.run([tools / 'bin/rosdep', 'update'], env=env, check=True, capture_output=True)
     return env
 

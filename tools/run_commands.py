@@ -22,8 +22,10 @@ import time
 import tomllib
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from tools.program import PSD_DEFLECTION, ROOT, Program, copy_checkout, ros_domain
 from tools.tasks import SHORTEST_BENCH, TASKS, install
@@ -39,37 +41,28 @@ INDENTED = re.compile(r'^ {4}(?:psd-deflection|make|python|ros2|pip) .+\n(?: {4,
 PROGRAMS = ('psd-deflection', 'make', 'ros2', 'pip', 'python', 'python3')
 DEVICE = 'ttyACM0'  # Where the simulated device is that a line with /dev/ttyACM0 gets.
 CUT = 'recordings/cut'  # A recording that a crash left without its end.
-
 _TABLES = tomllib.loads((ROOT / 'tools' / 'run_commands.toml').read_text(encoding='utf-8'))
 CI_RUNS: list[list[str]] = _TABLES['ci']
 SHORTER: dict[str, str] = _TABLES['shorter']
 TOOLS: dict[str, list[str]] = _TABLES['tools']
-
 ADMINISTRATION = re.compile(
     r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|source|ssh|sudo|systemctl|udevadm|useradd) '
 )
 """Lines for root or for another machine: never typed here. test/docs/test_docs.py checks the files they install."""
-
 HOURS = re.compile(r'^make mutants\b')  # Campaigns whose shortest form says nothing: never run here.
-
 FOREIGN = re.compile(r'^(python -m blind\.duels\b|make campaign NAME=duels\b|make release STEP=apt\b)')
 """Reads data of others, which are not in the repository."""
-
 NO_CAMPAIGNS, CLEAN = '--no-campaigns', '--clean'
-
 NEVER_HERE = ('a machine to administer', 'ros2', 'two hours', 'the data of others')
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
-
 LIVE = re.compile(
     r'^psd-deflection (estimator|monitor|chain)\b|--serve\b|^make run\b'
     r'|^ros2 (run|launch) psd_deflection (estimator|chain)\b(?!.*--show-args)'
 )
 BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b|^ros2 run tf2_ros ')
 """Nodes that run beside the lines below them."""
-
 AT_THE_BENCH = re.compile(r'^psd-deflection calibrate --live\b')
 """Records with a running daemon while the lines below it load the tip."""
-
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')  # Commands that speak to a running daemon.
 
 
@@ -223,21 +216,16 @@ def python_of(page: str, folder: Path) -> list[str]:
 
 def what_is_missing(line: str) -> str:
     """Why ``line`` cannot be run here (a missing program, or a command for root); '' if it can."""
-    if ADMINISTRATION.search(line):
-        return NEVER_HERE[0]
-    if HOURS.search(line):
-        return NEVER_HERE[2]
-    if FOREIGN.search(line):
-        return NEVER_HERE[3]
+    for pattern, need in ((ADMINISTRATION, 0), (HOURS, 2), (FOREIGN, 3)):
+        if pattern.search(line):
+            return NEVER_HERE[need]
     return ', '.join(t for p, tools in TOOLS.items() if re.search(p, line) for t in tools if not shutil.which(t))
 
 
 def stale() -> list[str]:
     lines = [c.line for c in commands()]
-    patterns = [p for p, *_ in CI_RUNS]
-    patterns += [
-        f'^make {kind} (NAME|STEP)={name}\\b' for kind, tasks in TASKS.items() for name in tasks if name != 'site'
-    ]
+    of_tasks = [(kind, name) for kind, tasks in TASKS.items() for name in tasks if name != 'site']
+    patterns = [*(p for p, *_ in CI_RUNS), *(f'^make {kind} (NAME|STEP)={name}\\b' for kind, name in of_tasks)]
     patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern, HOURS.pattern, FOREIGN.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
@@ -286,18 +274,9 @@ class CleanRoom:
             pip = [f'{self._venv}/bin/python', '-m', 'pip', 'uninstall', '--quiet', '--yes', *names]
             subprocess.run(pip, check=True)
 
-    @contextlib.contextmanager
-    def typing(self, line: str) -> Iterator[None]:
+    def typing(self, line: str) -> AbstractContextManager[object]:
         """Have the variables with which ``line`` is typed."""
-        variables = self._ours if OF_THE_TOOLS.search(line) else self._reader
-        before = {**os.environ}
-        try:
-            os.environ.clear()
-            os.environ.update(variables)
-            yield
-        finally:
-            os.environ.clear()
-            os.environ.update(before)
+        return patch.dict(os.environ, self._ours if OF_THE_TOOLS.search(line) else self._reader, clear=True)
 
 
 class Reader:
@@ -339,12 +318,10 @@ class Reader:
         elif LIVE.search(line):
             self._live(line)
         elif BESIDE.search(line):
-            self._background.append(self._start(line))
-            self._background[-1].until('publishing ')
+            self._beside(line, 'publishing ')
         elif AT_THE_BENCH.search(line):
             self._serve()
-            self._background.append(self._start(line))
-            self._background[-1].until('recording to ')
+            self._beside(line, 'recording to ')
         elif ASKS.search(line):
             self._serve()
             self._to_the_end(line)
@@ -353,8 +330,7 @@ class Reader:
             self._to_the_end(f'{command} ARGS="{words}"' if command else line, verdict)
         else:
             if line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')) and not self._background:
-                self._background.append(self._start('psd-deflection estimator'))
-                self._background[-1].until(r'θ +[-+]\d')
+                self._beside('psd-deflection estimator', r'θ +[-+]\d')
                 # The daemon of ros2 meets it later than its first line.
                 self._to_the_end("timeout 60 bash -c 'until ros2 lifecycle nodes | grep -q /estimator; do :; done'")
             self._to_the_end(line)
@@ -363,6 +339,10 @@ class Reader:
         """The line in a terminal, as a person types it."""
         words = line.replace('psd-deflection', self._program, 1) if line.startswith('psd-') else line
         return Program(['bash', '-c', f'exec {words}'], self._folder, terminal=True, wait_s=WAIT_S)
+
+    def _beside(self, line: str, begun: str) -> None:
+        self._background.append(self._start(line))
+        self._background[-1].until(begun)
 
     def _to_the_end(self, line: str, verdict: str = '') -> None:
         program = self._start(line)
@@ -399,8 +379,7 @@ class Reader:
 
     def _serve(self) -> None:
         if not self._background:
-            self._background.append(self._start('psd-deflection monitor'))
-            self._background[-1].until(r'θ +[-+]\d')
+            self._beside('psd-deflection monitor', r'θ +[-+]\d')
 
     def _press(self, line: str) -> None:
         self._serve()
@@ -408,10 +387,8 @@ class Reader:
         line = line.replace('http://127.0.0.1:8790', url)
         end = time.monotonic() + WAIT_S
         while True:
-            silent = '--silent' if 'POST' in line else '--silent --fail'
-            done = subprocess.run(
-                ['bash', '-c', f'{line} {silent}'], capture_output=True, text=True, check=True, timeout=WAIT_S
-            )
+            command = ['bash', '-c', f'{line} --silent' if 'POST' in line else f'{line} --silent --fail']
+            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=WAIT_S)
             answer: dict[str, Any] = json.loads(done.stdout) if 'POST' in line else {'ok': True}
             if answer['ok'] is True:
                 return
@@ -441,15 +418,9 @@ def main() -> int:
         full = (ROOT / 'bags/clean/clean_0.mcap').read_bytes()
         (folder / CUT).mkdir(parents=True)
         (folder / CUT / 'cut_0.mcap').write_bytes(full[: len(full) * 6 // 10])
-        os.environ.update(
-            PATH=f'{environment / "bin"}:{os.environ["PATH"]}',
-            VIRTUAL_ENV=str(environment),
-            VENV=str(environment),
-            MAKEFLAGS=f'VENV={environment}',
-            ROS_DOMAIN_ID=str(domain),
-            ROS_LOG_DIR=f'{temporary}/log',
-            XDG_STATE_HOME=f'{temporary}/state',
-        )
+        ours = {'VIRTUAL_ENV': str(environment), 'VENV': str(environment), 'MAKEFLAGS': f'VENV={environment}'}
+        places = {'ROS_LOG_DIR': f'{temporary}/log', 'XDG_STATE_HOME': f'{temporary}/state'}
+        os.environ.update(ours | places, ROS_DOMAIN_ID=str(domain), PATH=f'{environment / "bin"}:{os.environ["PATH"]}')
         room = CleanRoom(folder, Path(temporary)) if CLEAN in sys.argv else None
         reader = Reader(folder, room)
         if shutil.which('ros2'):
@@ -469,13 +440,10 @@ def main() -> int:
             nonlocal failures
             lines = [c.line for c in block if only in f'{c.page}: {c.line}']
             for line in [*lines]:
-                if not campaigns and is_campaign(line):
+                if why := NO_CAMPAIGNS if not campaigns and is_campaign(line) else what_is_missing(line):
                     lines.remove(line)
-                    passed_over.setdefault(NO_CAMPAIGNS, []).append(line)
-                elif missing := what_is_missing(line):
-                    lines.remove(line)
-                    passed_over.setdefault(missing, []).append(line)
-                    failures += os.environ.get('NEED_TOOLS') == '1' and missing not in NEVER_HERE
+                    passed_over.setdefault(why, []).append(line)
+                    failures += os.environ.get('NEED_TOOLS') == '1' and why not in (NO_CAMPAIGNS, *NEVER_HERE)
             return lines
 
         at_first = {*folder.iterdir(), folder / DEVICE}

@@ -3,10 +3,11 @@
 """Makes the pictures of the live page in docs/figures: ``make docs STEP=shots``; needs Chromium and its driver."""
 
 import argparse
+import contextlib
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,16 @@ DESK, PHONE = (1440, 900), (390, 844, 2.0, 'light', True)
 
 def anything(driver: Any) -> bool:
     return True
+
+
+@contextlib.contextmanager
+def page_of(*words: str) -> Iterator[str]:
+    """The address of the live page of ``psd-deflection monitor``, until the end."""
+    program = Program([*PSD_DEFLECTION, 'monitor', '--monitor-port', '0', *words])
+    try:
+        yield program.until(r'monitor: (http\S+)')[1]
+    finally:
+        program.end()
 
 
 def take(url: str, name: str, screen: Sequence[Any], seconds: float, ready: Callable[[Any], bool] = anything) -> None:
@@ -68,32 +79,20 @@ def drawn(seconds: float) -> Callable[[Any], bool]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
-    args = parser.parse_args()
-    seconds = args.seconds
-    monitor = [*PSD_DEFLECTION, 'monitor', '--monitor-port', '0']
+    seconds = parser.parse_args().seconds
+    with page_of('--demo') as url:
+        take(url, 'monitor', DESK, seconds, loaded if seconds > 10.0 else anything)
+        take(url, 'monitor_phone', PHONE, 4.0)
+    with page_of('bags/laser_off', '--loop') as url:
+        take(url, 'monitor_laser_off', DESK, 1.0, shows('laser 1 lost', 'laser 2 lost'))
     with tempfile.TemporaryDirectory() as folder:
-        program = Program([*monitor, '--demo'])
-        try:
-            url = program.until(r'monitor: (http\S+)')[1]
-            take(url, 'monitor', DESK, seconds, loaded if seconds > 10.0 else anything)
-            take(url, 'monitor_phone', PHONE, 4.0)
-        finally:
-            program.end()
-        program = Program([*monitor, 'bags/laser_off', '--loop'], FIGURES.parents[1])
-        try:
-            url = program.until(r'monitor: (http\S+)')[1]
-            take(url, 'monitor_laser_off', DESK, 1.0, shows('laser 1 lost', 'laser 2 lost'))
-        finally:
-            program.end()
         port = f'{folder}/rig_port'
         device = Program([*PSD_DEFLECTION, 'simulate', '--serve', '--link', port])
         device.until('port: ')
-        program = Program([*monitor, '--port', port])
         try:
-            url = program.until(r'monitor: (http\S+)')[1]
-            take(url, 'monitor_away', DESK, 3.0, away_without(device))
+            with page_of('--port', port) as url:
+                take(url, 'monitor_away', DESK, 3.0, away_without(device))
         finally:
-            program.end()
             device.end()
     return 0
 

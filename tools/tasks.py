@@ -30,13 +30,8 @@ class Task(NamedTuple):
 
 
 ROOT_WORD = '' if os.geteuid() == 0 else 'sudo '
-WORDS = {
-    '{jobs}': f'--jobs {os.cpu_count() or 1}',
-    '{root}': str(ROOT),
-    '{python}': sys.executable,
-    '{purelib}': sysconfig.get_path('purelib'),
-    '{sudo}': ROOT_WORD,
-}
+WORDS = {'{jobs}': f'--jobs {os.cpu_count() or 1}', '{root}': str(ROOT), '{python}': sys.executable}
+WORDS |= {'{purelib}': sysconfig.get_path('purelib'), '{sudo}': ROOT_WORD}
 _TABLES = tomllib.loads((ROOT / 'tools' / 'tasks.toml').read_text(encoding='utf-8'))
 WORDS['{site}'] = _TABLES['docs']['site']['line']
 BENCH: dict[str, list[str]] = _TABLES.pop('bench')
@@ -66,8 +61,7 @@ def bench(words: list[str]) -> int:
         arguments = '' if full else short if shortest else look
         results = {'cpu': 'cpu.json', 'solvers': '', 'accuracy': ''}.get(module, 'results.json')
         into = f'--results {out / results}' if results else ''
-        status = shell(f'python -m bench.{module} {arguments} {into}')
-        if status:
+        if status := shell(f'python -m bench.{module} {arguments} {into}'):
             return status
     return shell('python -m bench.page') if full else 0
 

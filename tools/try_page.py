@@ -17,18 +17,15 @@ from tools.browser import emulate, open_browser, picture, served
 
 LIMIT_S = 1200.0
 """Longest wait for an answer: a busy machine, both cores taken, computes many times as long as an idle one."""
-
 NO_OTHER_HOST = '--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1'
 HIDDEN = (0, 'drawn', '')  # What is chosen, one after the other: the first of the list, one drawn by chance, nothing.
-
 NOTHING = 'Nothing is missing: '
 SIZE = (940, 1250)  # Of the picture.
 
 
 def state(driver: Any) -> str:
     """What the page says of itself: ready, absent, running, done or failed."""
-    value: str | None = driver.execute_script('return document.getElementById("try-form").dataset.state')
-    return value or ''
+    return str(driver.execute_script('return document.getElementById("try-form").dataset.state') or '')
 
 
 def text(driver: Any, name: str) -> str:
@@ -72,9 +69,7 @@ def main() -> int:
                 hidden = answered(driver, choice)
                 message = text(driver, 'answer')
                 failures += wrong(hidden, message)
-                print(
-                    f'{hidden}: {message.splitlines()[0]}\n{text(driver, "steps")}\n{text(driver, "state")}', flush=True
-                )
+                print(f'{hidden}: {message.splitlines()[0]}', text(driver, 'steps'), text(driver, 'state'), sep='\n')
                 if choice != HIDDEN[0]:
                     continue
                 if args.picture is not None:

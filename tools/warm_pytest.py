@@ -23,13 +23,9 @@ OPTIONS = (
     *('-x', '-q', '-p', 'no:cacheprovider', '-p', 'pytest_timeout', '-m', 'not browser'),
     *('-W', 'ignore::pytest.PytestAssertRewriteWarning'),
 )
-
 OURS = ('psd_deflection', 'msg_adapters', 'test', 'blind', 'bench', 'tools')
-
 LONGEST = 600.0  # s that one of the arguments may take at first.
-
 MOST = 120.0  # s, as measured at first, that the tests of one function may take together.
-
 Entered = dict[int, CodeType]
 
 

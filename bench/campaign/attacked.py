@@ -3,6 +3,7 @@
 """The nodes that ``bench.campaign.messages`` attacks: each as it is used, what is right for it, and what is not."""
 
 import contextlib
+import functools
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -102,33 +103,27 @@ def trajectory() -> Any:
     return out
 
 
-class _Pictures:
-    """A photograph of the target as each message has it; drawn once."""
-
-    def __init__(self) -> None:
-        self._files: dict[str, bytes] = {}
-        self.scene = Scene(width=320, height=240, focal=1000.0, centre=(165.0, 114.0))
-
-    @property
-    def grey(self) -> Any:
-        if 'grey' not in self._files:
-            self._files['grey'] = photograph(self.scene, [Pose()], np.random.default_rng(0)).tobytes()
-        return np.frombuffer(self._files['grey'], np.uint8).reshape(self.scene.height, self.scene.width)
-
-    def image(self) -> Any:
-        rows = self.grey
-        out = Image(height=rows.shape[0], width=rows.shape[1], encoding='mono8', step=rows.shape[1])
-        out.data = rows.tobytes()
-        return _stamped(out)
-
-    def compressed(self) -> Any:
-        kind = ('png', 'jpeg')[time.monotonic_ns() // 1000 % 2]
-        if kind not in self._files:
-            self._files[kind] = opencv().imencode(f'.{kind}', self.grey)[1].tobytes()
-        return _stamped(CompressedImage(format=kind, data=self._files[kind]))
+SCENE = Scene(width=320, height=240, focal=1000.0, centre=(165.0, 114.0))
 
 
-PICTURES = _Pictures()
+@functools.cache
+def _photograph(kind: str = '') -> Any:
+    """Of the target: rows of pixels, or a file of that kind."""
+    if kind:
+        return opencv().imencode(f'.{kind}', _photograph())[1].tobytes()
+    return photograph(SCENE, [Pose()], np.random.default_rng(0))
+
+
+def _image() -> Any:
+    size = {'height': SCENE.height, 'width': SCENE.width, 'step': SCENE.width}
+    return _stamped(Image(encoding='mono8', data=_photograph().tobytes(), **size))
+
+
+def _compressed() -> Any:
+    kind = ('png', 'jpeg')[time.monotonic_ns() // 1000 % 2]
+    return _stamped(CompressedImage(format=kind, data=_photograph(kind)))
+
+
 GOOD: Mapping[str, Good] = {
     LOAD: _load,
     REFERENCE: _reference,
@@ -136,9 +131,9 @@ GOOD: Mapping[str, Good] = {
     TEMPERATURE: lambda: _stamped(Temperature(temperature=21.0)),
     MARK: lambda: String(data='a mark'),
     ACCELERATION: lambda: _stamped(AccelStamped(), 'link_base'),
-    '/image': PICTURES.image,
-    '/image/compressed': PICTURES.compressed,
-    '/camera_info': lambda: _stamped(CameraInfo(k=[float(v) for v in PICTURES.scene.matrix], d=[0.0] * 5)),
+    '/image': _image,
+    '/image/compressed': _compressed,
+    '/camera_info': lambda: _stamped(CameraInfo(k=[float(v) for v in SCENE.matrix], d=[0.0] * 5)),
     '/end_effector/deflection': deflection,
     '/joint_states': joints,
     '/compensator/applied': lambda: Float64MultiArray(data=[0.0, 0.0]),
@@ -290,15 +285,9 @@ class Compensator(Attacked):
 
     def __init__(self, folder: Path) -> None:
         # A busy machine is late, and what is right would be stale.
+        state, axes, names = 'std_msgs/msg/Bool', ('x', 'z'), tuple(NAMES)
         settings = CompensatorSettings(
-            tip='tool',
-            urdf=str(URDF),
-            drive=True,
-            axes=('x', 'z'),
-            joints=tuple(NAMES),
-            good=1,
-            stale=1.0,
-            controller_state='std_msgs/msg/Bool',
+            tip='tool', urdf=str(URDF), drive=True, axes=axes, joints=names, good=1, stale=1.0, controller_state=state
         )
         self._node = CompensatorNode(settings, null_log, str)
         super().__init__(self._node)
@@ -360,11 +349,10 @@ class Shaper(Attacked):
             self._last = None
             return
         self._shaped += 1
-        points = message.points
         states = np.array(
-            [[part for part in (p.positions, p.velocities, p.accelerations) if len(part)] for p in points]
+            [[part for part in (p.positions, p.velocities, p.accelerations) if len(part)] for p in message.points]
         )
-        times = np.array([p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in points])
+        times = np.array([p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points])
         start_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         if not np.all(np.isfinite(states)) or np.any(np.diff(times) <= 0.0) or not start_ns > 0:
             self._wrong.append(f'passed on: {message}'[:500])
@@ -399,10 +387,5 @@ class Shaper(Attacked):
         return f'{self._shaped} trajectories shaped; largest step {self.step:.4f} of speed * {KINK_S:g} s'
 
 
-NODES: Mapping[str, type[Any]] = {
-    'estimator': Estimator,
-    'camera': Camera,
-    'chain': Chain,
-    'compensator': Compensator,
-    'shaper': Shaper,
-}
+EVERY = (Estimator, Camera, Chain, Compensator, Shaper)
+NODES: Mapping[str, type[Any]] = {node.__name__.lower(): node for node in EVERY}

@@ -25,25 +25,27 @@ from psd_deflection.camera.target import target_of
 
 REST = 4
 RUN = 20  # Frames of one rendered rig, after those at rest.
-
 SIGMAS = 5.0
 
 
 def settings_of(scene: render.Scene, rest: int = 0) -> CameraSettings:
-    return CameraSettings(
-        rest_frames=rest,
-        matrix=tuple(scene.matrix),
-        distortion=tuple(scene.distortion),
-        view=scene.view,
-        spacing=scene.spacing,
-        radius=scene.radius,
-    )
+    m, d, view, spacing, radius = tuple(scene.matrix), tuple(scene.distortion), scene.view, scene.spacing, scene.radius
+    return CameraSettings(rest_frames=rest, matrix=m, distortion=d, view=view, spacing=spacing, radius=radius)
+
+
+def rested(
+    scene: render.Scene, settings: CameraSettings, frames: int, still: Any, rng: np.random.Generator
+) -> CameraReference:
+    """What has seen so many frames of the plate at rest, ``still`` without noise."""
+    reference = CameraReference(replace(settings, rest_frames=frames), target_of)
+    for _ in range(frames):
+        reference.take(0, render.developed(scene, still, rng))
+    return reference
 
 
 def random_scene(rng: np.random.Generator) -> Any:
     """A camera, a target and a light as a laboratory may have them."""
-    lens = rng.uniform(-0.25, 0.1)
-    white = rng.uniform(120.0, 250.0)
+    lens, white = rng.uniform(-0.25, 0.1), rng.uniform(120.0, 250.0)
     return render.Scene(
         focal=rng.uniform(1200.0, 2600.0),
         centre=(rng.uniform(300.0, 340.0), rng.uniform(220.0, 260.0)),
@@ -64,10 +66,8 @@ def random_scene(rng: np.random.Generator) -> Any:
 
 def random_motion(rng: np.random.Generator) -> Any:
     """A link that rings: bending and twist together, some mm and degrees."""
-    amplitude = rng.uniform(0.0, 4e-3, 2)
-    twist = rng.uniform(0.0, 0.05)
-    phase = rng.uniform(0.0, 2 * np.pi, 3)
-    still = rng.uniform(-2e-3, 2e-3, 2)
+    amplitude, twist = rng.uniform(0.0, 4e-3, 2), rng.uniform(0.0, 0.05)
+    phase, still = rng.uniform(0.0, 2 * np.pi, 3), rng.uniform(-2e-3, 2e-3, 2)
 
     def motion(t: float) -> Any:
         dx = still[0] + amplitude[0] * math.sin(2 * math.pi * 14.0 * t + phase[0])
@@ -171,9 +171,7 @@ def runs(frames: int, seed: int) -> Iterator[tuple[str, FrameAnswer, tuple[float
         number += 1
         rng = np.random.default_rng([seed, number])
         scene, motion = random_scene(rng), random_motion(rng)
-        reference = CameraReference(settings_of(scene, REST), target_of)
-        for _ in range(REST):
-            reference.take(0, render.photograph(scene, [render.Pose()], rng))
+        reference = rested(scene, settings_of(scene), REST, render.clean(scene, [render.Pose()]), rng)
         if reference.rest is None:
             # The plate at rest is not whole in the picture: another rig.
             continue
@@ -245,9 +243,7 @@ def accuracy_table(frames: int, seed: int) -> bool:
     print('    theta mdeg  bound  in 95 %')
     for name, scene in SCALES.items():
         rng = np.random.default_rng(seed)
-        reference = CameraReference(settings_of(scene, 8), target_of)
-        for _ in range(8):
-            reference.take(0, render.photograph(scene, [render.Pose()], rng))
+        reference = rested(scene, settings_of(scene), 8, render.clean(scene, [render.Pose()]), rng)
         off, centres, inside = [], [], []
         for _ in range(frames):
             pose = moved(rng)
@@ -272,7 +268,6 @@ def accuracy_table(frames: int, seed: int) -> bool:
 
 
 BOARD_THETA = 0.003  # Largest rms error of theta by a board, degrees: a tenth of what is asked of the discs.
-
 VIEWS = {
     '640 x 480': render.Scene(focal=1700.0, roll=0.02),
     '1920 x 1080': render.Scene(width=1920, height=1080, focal=4200.0, centre=(960.0, 520.0), blur=1.0, roll=0.02),
@@ -289,17 +284,11 @@ def _board(settings: CameraSettings) -> Board:
 def board_picture(settings: CameraSettings) -> Any:
     """How a board of these settings is drawn: (scene, pose) -> grey levels without noise."""
     target = _board(settings)
-    size = target.size
-    texture = boards.picture(target.board, (round(size[0] * 2e4), round(size[1] * 2e4))) / 255.0
-
-    def picture(scene: render.Scene, pose: render.Pose) -> Any:
-        return render.board(scene, pose, texture, size)
-
-    return picture
+    texture = boards.picture(target.board, (round(target.size[0] * 2e4), round(target.size[1] * 2e4))) / 255.0
+    return lambda scene, pose: render.board(scene, pose, texture, target.size)
 
 
 def discs_picture(scene: render.Scene, pose: render.Pose) -> Any:
-    """Grey levels of the three discs without noise."""
     return render.clean(scene, [pose])
 
 
@@ -333,10 +322,7 @@ def near_corners(scene: render.Scene, settings: CameraSettings) -> Any:
 def theta_error(scene: render.Scene, settings: CameraSettings, picture: Any, frames: int, seed: int) -> float:
     """Rms error of theta over ``frames`` moved frames, degrees."""
     rng = np.random.default_rng(seed)
-    reference = CameraReference(replace(settings, rest_frames=4), target_of)
-    still = picture(scene, render.Pose())
-    for _ in range(4):
-        reference.take(0, render.developed(scene, still, rng))
+    reference = rested(scene, settings, 4, picture(scene, render.Pose()), rng)
     off = []
     for _ in range(frames):
         pose = moved(rng)
@@ -362,10 +348,9 @@ def boards_table(frames: int, seed: int, *, short: bool = False) -> bool:
             corner = theta_error(scene, board, picture, frames, seed)
             mask = near_corners(scene, board)
             of_corners, of_all = np.degrees(pose_bounds(scene, picture, mask, everywhere)[:, 2])
-            print(
-                f'{name:12} {tilt:4.0f}   {disc:.5f}  {of_disc:.5f}    {corner:.5f}  {of_corners:.5f}    {of_all:.5f} '
-                f'{disc / corner:9.1f}  {of_disc / of_corners:6.1f}  {of_disc / of_all:9.1f}'
-            )
+            sizes = f'{disc:.5f}  {of_disc:.5f}    {corner:.5f}  {of_corners:.5f}    {of_all:.5f}'
+            ratios = f'{disc / corner:9.1f}  {of_disc / of_corners:6.1f}  {of_disc / of_all:9.1f}'
+            print(f'{name:12} {tilt:4.0f}   {sizes} {ratios}')
             fine &= corner <= BOARD_THETA
     print(f'theta by the board is {"" if fine else "NOT "}within {BOARD_THETA:g} degrees')
     return fine
@@ -384,16 +369,15 @@ def cost_table(frames: int, seed: int) -> None:
         reference = CameraReference(settings_of(scene, 2), target_of)
         for image in images[:3]:
             reference.take(0, image)
-        ours, theirs = [], []
+        stamps = []
         # In turn: what else the machine does falls on both.
         for image in images:
             began = time.process_time()
             reference.take(0, image)
             middle = time.process_time()
             cv2.findCirclesGrid(image, (1, 3), flags=cv2.CALIB_CB_SYMMETRIC_GRID, blobDetector=finder)
-            ours.append(middle - began)
-            theirs.append(time.process_time() - middle)
-        ms = 1e3 * float(np.median(ours)), 1e3 * float(np.median(theirs))
+            stamps.append((began, middle, time.process_time()))
+        ms = 1e3 * np.median(np.diff(stamps), axis=0)
         print(f'{name:12} {ms[0]:10.1f}  {ms[1]:15.1f}  {ms[0] / ms[1]:5.2f}')
 
 

@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -45,14 +45,8 @@ class Fault:
     back: bool = False
 
 
-BAD = ('bad frames',)
-AWAY = ('disconnects',)
-
+BAD, AWAY, STILL = ('bad frames',), ('disconnects',), ('rejected: frozen', 'found: psd_2 stands still')
 STOLEN = 512  # Bytes: some of them were samples.
-
-
-def pause(seconds: float) -> None:
-    time.sleep(seconds)
 
 
 def _while(seconds: float, **attributes: object) -> Act:
@@ -61,17 +55,12 @@ def _while(seconds: float, **attributes: object) -> Act:
     def act(line: Line, pid: int) -> None:
         with line.lock:
             before = {name: getattr(line, name) for name in attributes}
-            _set(line, attributes)
-        pause(seconds)
+            vars(line).update(attributes)
+        time.sleep(seconds)
         with line.lock:
-            _set(line, before)
+            vars(line).update(before)
 
     return act
-
-
-def _set(line: Line, attributes: Mapping[str, object]) -> None:
-    for name, value in attributes.items():
-        setattr(line, name, value)
 
 
 def _changed(change: Callable[[Line, bytes], bytes | None], seconds: float) -> Act:
@@ -82,12 +71,7 @@ def _changed(change: Callable[[Line, bytes], bytes | None], seconds: float) -> A
 def _once(change: Callable[[Line, bytes], bytes]) -> Act:
     def act(line: Line, pid: int) -> None:
         first = iter((change,))
-
-        def tamper(line: Line, frame: bytes) -> bytes | None:
-            todo = next(first, None)
-            return todo(line, frame) if todo is not None else None
-
-        _changed(tamper, 0.03)(line, pid)
+        _changed(lambda line, frame: todo(line, frame) if (todo := next(first, None)) else None, 0.03)(line, pid)
 
     return act
 
@@ -95,7 +79,7 @@ def _once(change: Callable[[Line, bytes], bytes]) -> Act:
 def _injected(make: Callable[[Line], bytes], seconds: float = 0.03) -> Act:
     def act(line: Line, pid: int) -> None:
         line.inject(make(line))
-        pause(seconds)
+        time.sleep(seconds)
 
     return act
 
@@ -135,7 +119,7 @@ def _replugged(after_s: float = 0.1, names: tuple[str, str] | None = None, resta
         line.unplug()
         if restart:
             line.restart()
-        pause(after_s)
+        time.sleep(after_s)
         line.plug(line.name if names is None else names[line.name == names[0]])
 
     return act
@@ -146,7 +130,7 @@ def _replugged_beside_another(line: Line, pid: int) -> None:
     line.unplug()
     other = Line(line.folder, old)
     other.serial = 'SOMEBODY-ELSE'
-    pause(0.3)
+    time.sleep(0.3)
     line.plug('port_c' if old != 'port_c' else 'port')
 
     def leave() -> None:
@@ -165,7 +149,7 @@ def _held_by_another(line: Line, pid: int) -> None:
     except serial.SerialException:
         # The node was quicker: then nobody else can have it, which is the point.
         return
-    pause(0.4)
+    time.sleep(0.4)
     holder.close()
 
 
@@ -194,34 +178,29 @@ def _duplicates(line: Line, pid: int) -> None:
     # append() returns None: the frames go on as they are.
     _changed(lambda line, frame: frames.append(frame), 0.03)(line, pid)
     line.inject(b''.join(frames[-30:]))
-    pause(0.02)
+    time.sleep(0.02)
 
 
 def _swapped(line: Line, pid: int) -> None:
     waiting: list[bytes] = []
-    done: list[bool] = []
 
     def tamper(identity: int, frame: bytes) -> bytes | None:
-        if done:
-            return None
-        if not waiting:
-            waiting.append(frame)
-            return b''
-        done.append(True)
-        with line.lock:
-            line.taken_by_fault.discard(identity)
-        return None
+        waiting.append(frame)
+        if len(waiting) == 2:
+            with line.lock:
+                line.taken_by_fault.discard(identity)
+        return b'' if len(waiting) == 1 else None
 
     _while(0.02, tamper=tamper)(line, pid)
     line.inject(waiting[0] if waiting else b'')
-    pause(0.01)
+    time.sleep(0.01)
 
 
 def _jump(samples: int, us: int) -> Act:
 
     def act(line: Line, pid: int) -> None:
         line.jump(samples, us)
-        pause(0.05)
+        time.sleep(0.05)
 
     return act
 
@@ -230,7 +209,7 @@ def _restart(seq: int = 0) -> Act:
     def act(line: Line, pid: int) -> None:
         line.restart(seq, 0)
         line.inject(encode(hello_of()))
-        pause(0.08)
+        time.sleep(0.08)
 
     return act
 
@@ -239,7 +218,7 @@ def _overrun(line: Line, pid: int) -> None:
     with line.lock:
         # The first sample after the silence carries the flag.
         line.mute, line.flags = True, 2
-    pause(0.03)
+    time.sleep(0.03)
     with line.lock:
         line.mute = False
 
@@ -249,12 +228,12 @@ def _stopped(line: Line, pid: int) -> None:
         line.mute = line.obedient = True
     deadline = time.monotonic() + 8.0
     while line.mute and time.monotonic() < deadline:
-        pause(0.01)
+        time.sleep(0.01)
 
 
 def _frozen_node(line: Line, pid: int) -> None:
     os.kill(pid, signal.SIGSTOP)
-    pause(0.3)
+    time.sleep(0.3)
     os.kill(pid, signal.SIGCONT)
 
 
@@ -302,14 +281,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault('laser 1 off', _dark(2, 3), ('rejected: laser_lost',), estimates=True),
     Fault('laser 2 off', _dark(5, -2), ('rejected: laser_lost',), estimates=True),
     Fault('y1 saturated', _while(0.15, optics={1: 32767}), ('rejected: saturated',), estimates=True),
-    Fault(
-        'psd_2 stands still',
-        _while(0.25, freeze=True),
-        ('rejected: frozen', 'found: psd_2 stands still'),
-        estimates=True,
-    ),
+    Fault('psd_2 stands still', _while(0.25, freeze=True), (*STILL,), estimates=True),
 )
-
 START_S = 300.0
 RECOVER_S = 5.0
 BACK_S = 1.0  # A device that is back is read again within this.
@@ -349,12 +322,8 @@ class Witness(Spun):
         self.estimates += 1
 
     def _report(self, report: DiagnosticArray) -> None:
-        counters = {}
-        for status in report.status:
-            for value in status.values:
-                if value.value.lstrip('-').isdigit():
-                    counters[value.key] = float(value.value)
-        self.counters = counters
+        values = [value for status in report.status for value in status.values]
+        self.counters = {v.key: float(v.value) for v in values if v.value.lstrip('-').isdigit()}
         self.reports += 1
 
     def next_report(self) -> dict[str, float]:
@@ -408,10 +377,8 @@ def lost_samples(rows: list[Row], line: Line, recording: Path, start: int, end: 
 
 
 def report(rows: list[Row], lost: dict[str, tuple[int, int]]) -> bool:
-    print(
-        f'{"fault":52} {"times":>5} {"detected":>8} {"recovered":>9} {"median s":>8} {"worst s":>8} '
-        f'{"taken":>7} {"lost":>5}'
-    )
+    head = f'{"fault":52} {"times":>5} {"detected":>8} {"recovered":>9} {"median s":>8} {"worst s":>8}'
+    print(f'{head} {"taken":>7} {"lost":>5}')
     good = True
     for row in rows:
         missing, taken = lost[row.fault.name]
@@ -420,10 +387,9 @@ def report(rows: list[Row], lost: dict[str, tuple[int, int]]) -> bool:
         fine = row.recovered == row.injected == row.detected and missing == 0
         fine = fine and (not row.fault.back or worst <= BACK_S)
         good = good and fine
-        print(
-            f'{row.fault.name:52} {row.injected:5d} {detected:>8} {row.recovered:9d} {np.median(row.times):8.3f} '
-            f'{worst:8.3f} {taken:7d} {missing:5d}{"" if fine else "  <-- NOT AS IT MUST BE"}'
-        )
+        figures = f'{row.injected:5d} {detected:>8} {row.recovered:9d} {np.median(row.times):8.3f} {worst:8.3f}'
+        wrong = '' if fine else '  <-- NOT AS IT MUST BE'
+        print(f'{row.fault.name:52} {figures} {taken:7d} {missing:5d}{wrong}')
     between = lost['between the faults'][0]
     print(f'{"between the faults":52} {"":40} {"":7} {between:5d}')
     return good and between == 0

@@ -18,12 +18,11 @@ from pathlib import Path
 import zstandard
 
 ROOT = Path(__file__).resolve().parents[2]
+MEMORY = '/dev/shm' if Path('/dev/shm').is_dir() else None
 LIMITS = ['-timeout=60', '-rss_limit_mb=256', '-max_len=65536']
-
 HANG_S = 1.0
 """More than this in one reading of an input is a hang, in seconds of the processor: libFuzzer's clock runs on while
 others have the machine, and stays for what never comes back at all. Coverage makes a reading three times as long."""
-
 Target = Callable[[bytes], list[str]]
 """Reads an input, and returns what the package rejects of it; whatever else it raises is a defect."""
 
@@ -49,15 +48,8 @@ def evaluated(target: Target, content: bytes) -> list[str]:
 
 def frames_target() -> tuple[Target, list[bytes]]:
     """The decoder: whole, and byte by byte, gives the same."""
-    from psd_deflection.devices.protocol.frames import (
-        BadFrame,
-        FrameDecoder,
-        HelloFrame,
-        PingFrame,
-        SampleFrame,
-        StatusFrame,
-        encode,
-    )
+    from psd_deflection.devices.protocol import frames
+    from psd_deflection.devices.protocol.frames import BadFrame, FrameDecoder, SampleFrame, encode
     from psd_deflection.records import MOST_PSDS
 
     @timed()
@@ -77,9 +69,8 @@ def frames_target() -> tuple[Target, list[bytes]]:
 
     seeds = [
         *(bytes((n - 2,)) + encode(SampleFrame(0, 1, 1000, tuple(range(3 * n)))) for n in range(2, MOST_PSDS + 1)),
-        encode(StatusFrame(3, None)),
-        encode(HelloFrame(1, {'serial': 'A'})),
-        encode(PingFrame(7)),
+        *(encode(frames.StatusFrame(3, None)), encode(frames.HelloFrame(1, {'serial': 'A'}))),
+        encode(frames.PingFrame(7)),
     ]
     return target, seeds
 
@@ -88,8 +79,7 @@ def _file_target(suffix: str, *steps: Callable[[Path], object]) -> Target:
     """Writes the input to a file, and reads that by each of ``steps``."""
     from psd_deflection.base.errors import PsdDeflectionError
 
-    folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
-    path = folder / f'input{suffix}'
+    path = Path(tempfile.mkdtemp(dir=MEMORY)) / f'input{suffix}'
 
     def target(content: bytes) -> list[str]:
         path.write_bytes(content)
@@ -133,23 +123,18 @@ def bag_target() -> tuple[Target, list[bytes]]:
 
 def csv_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.recordings.read.readers import open_recording
+    from psd_deflection.recordings.recording import Recording
 
     seed = b't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz\n'
     seed += b''.join(b'%d.%03d,0,1e-3,5,-1,2,5,1,0,0\n' % (i // 1000, i % 1000) for i in range(30))
-    target = _file_target(
-        '.csv',
-        lambda path: list(open_recording(path).blocks()),
-        lambda path: list(open_recording(path).loads()),
-        lambda path: list(open_recording(path).references()),
-        lambda path: list(open_recording(path).temperatures()),
-    )
-    return target, [seed]
+    parts = (Recording.blocks, Recording.loads, Recording.references, Recording.temperatures)
+    return _file_target('.csv', *(lambda path, part=part: list(part(open_recording(path))) for part in parts)), [seed]
 
 
 def parameters_target() -> tuple[Target, list[bytes]]:
     """A parameter file, and the rig of it; the kept zero as well."""
     from psd_deflection.rig.config import load_rig
-    from psd_deflection.run.zero_store import ZeroStore
+    from psd_deflection.run.state import ZeroStore
 
     nominal = load_rig()
 
@@ -196,8 +181,7 @@ class Choices:
         if kind == 3:
             return int.from_bytes(self.take(4), 'little', signed=True) * 10 ** (self.below(2) * self.below(400))
         if kind == 4:
-            (number,) = struct.unpack('<d', self.take(8))
-            return number
+            return float(struct.unpack('<d', self.take(8))[0])
         if kind < 7:
             return self.text() if kind == 5 else 'x' * self.below(3000)
         if kind == 7:
@@ -223,13 +207,8 @@ def hello_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.run.hello import HelloGate
 
     rig = load_rig()
-    good: dict[str, object] = {
-        'serial': 'A',
-        'firmware': '1',
-        'sample_rate_hz': 1000.0,
-        'channels': list(CHANNELS),
-        'volts_per_count': rig.converter.volts_per_count,
-    }
+    good: dict[str, object] = {'serial': 'A', 'firmware': '1', 'sample_rate_hz': 1000.0, 'channels': list(CHANNELS)}
+    good['volts_per_count'] = rig.converter.volts_per_count
 
     @timed()
     def target(content: bytes) -> list[str]:
@@ -242,9 +221,7 @@ def hello_target() -> tuple[Target, list[bytes]]:
             except (ValueError, OverflowError):
                 # It does not fit into a frame.
                 continue
-            for frame in frames:
-                if not isinstance(frame, HelloFrame):
-                    continue
+            for frame in (f for f in frames if isinstance(f, HelloFrame)):
                 try:
                     gate.take(frame, 'port', volts=False)
                 except DeviceError as error:
@@ -338,14 +315,13 @@ def yaml_target() -> tuple[Target, list[bytes]]:
             return anchor + '{' + ', '.join(f'{k}: {message(choices, depth + 1, anchors)}' for k in keys) + '}'
         return anchor + tags[choices.below(len(tags))] + json.dumps(choices.value(4))
 
-    folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
+    path = Path(tempfile.mkdtemp(dir=MEMORY)) / 'input.yaml'
 
     @timed()
     def target(content: bytes) -> list[str]:
         text = message(Choices(content), 0, [])
         rejected = []
         for head, read in (('/**: {ros__parameters: ', load_rig), ('rosbag2_bagfile_information: ', read_information)):
-            path = folder / 'input.yaml'
             path.write_text(head + text + ('}' if head.startswith('/') else ''), errors='replace')
             try:
                 read(path)
@@ -357,16 +333,8 @@ def yaml_target() -> tuple[Target, list[bytes]]:
 
 
 GRAMMARS = ('hello', 'records', 'yaml')  # Targets whose input is a list of choices: any bytes are an input.
-
-TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {
-    'frames': frames_target,
-    'hello': hello_target,
-    'bag': bag_target,
-    'records': records_target,
-    'csv': csv_target,
-    'parameters': parameters_target,
-    'yaml': yaml_target,
-}
+EVERY = (frames_target, hello_target, bag_target, records_target, csv_target, parameters_target, yaml_target)
+TARGETS: dict[str, Callable[[], tuple[Target, list[bytes]]]] = {f.__name__.removesuffix('_target'): f for f in EVERY}
 """Each target with inputs to begin from, of which the first is whole."""
 
 
@@ -410,10 +378,9 @@ def corrupted(count: int) -> int:
             print(f'accepted with another content: {bytes(damaged).hex()}')
         else:
             lost += 1
-    print(
-        f'{count} damaged frames: {rejected} rejected, {same} came out as they were sent, '
-        f'{lost} taken for another kind, {wrong} accepted with a wrong content (chance alone: {count * 2.0**-32:.4f})'
-    )
+    print(f'{count} damaged frames: {rejected} rejected, {same} came out as they were sent,', end=' ')
+    chance_alone = f'(chance alone: {count * 2.0**-32:.4f})'
+    print(f'{lost} taken for another kind, {wrong} accepted with a wrong content {chance_alone}')
     return 1 if wrong else 0
 
 
@@ -423,14 +390,12 @@ def everything(words: list[str]) -> int:
     parser.add_argument('--seconds', type=float, default=600.0, help='of each target and of the messages')
     parser.add_argument('--frames', type=int, default=10_000_000)
     options = parser.parse_args(words)
-    runs = [
-        ['fuzz', 'corrupted', str(options.frames)],
-        ['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)],
-        *(['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS),
-    ]
+    runs = [['fuzz', 'corrupted', str(options.frames)]]
+    runs.append(['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)])
+    runs += [['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS]
     for module, *arguments in runs:
-        status = subprocess.run([sys.executable, '-m', f'bench.campaign.{module}', *arguments], check=False).returncode
-        if status:
+        command = [sys.executable, '-m', f'bench.campaign.{module}', *arguments]
+        if status := subprocess.run(command, check=False).returncode:
             return status
     return 0
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import rclpy
@@ -27,9 +27,7 @@ from tools.program import ROOT
 HOLD_S = 0.2  # The offsets must not change later than this after a fault.
 RELEASE_S = 0.2  # They must be back at zero so long after the time that ``MAX_RATE`` needs.
 WITHIN = 1.0 + 1e-6  # The largest step over what the rate allows.
-
 TRIES = 5
-
 WATCHED_S = 0.4
 """How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 RELAYED = {
@@ -37,14 +35,12 @@ RELAYED = {
     'driver': ('/arm/joints', '/joint_states', JointState),
 }
 """What a process passes on: from the arm, to the compensator, and the type."""
-
 SENT: dict[str, tuple[int, tuple[str, ...]]] = {
     'estimator killed': (signal.SIGKILL, ('estimator',)),
     'DDS killed': (signal.SIGKILL, ('estimator', 'driver')),
     'DDS stopped': (signal.SIGSTOP, ('estimator', 'driver')),
 }
 """Faults that are signals, and the processes that get them."""
-
 ROBOT = ('protective stop', 'speed scaling 0', 'controller ended', 'joints do not follow', 'another publisher')
 """Faults of the robot and its controller."""
 COMPENSATOR, CONTROLLER, SHAPER, ACTION = 'compensator', 'controller', 'shaper', 'action'  # All of their faults.
@@ -144,7 +140,7 @@ class Campaign(Graph):
         self.spin(LONGEST_S, self.follows, f'offsets that follow after: {name}')
         return out, late
 
-    def _begin(self, name: str) -> Callable[[], None]:
+    def _begin(self, name: str) -> Callable[[], object]:
         plant = self.plant
         if name in SENT:
             number, victims = SENT[name]
@@ -160,7 +156,7 @@ class Campaign(Graph):
             self._scaling.publish(Float64(data=0.0))
         elif name == 'another publisher':
             other_publisher = self.node.create_publisher(Float64MultiArray, '/compensator/offsets', 5)
-            return lambda: self._destroy(other_publisher)
+            return lambda: self.node.destroy_publisher(other_publisher)
         else:
             plant.stands = True
             plant.arm.force *= 1.4
@@ -172,9 +168,6 @@ class Campaign(Graph):
     def _again(self, victims: Sequence[str]) -> None:
         for victim in victims:
             self.relays[victim].again()
-
-    def _destroy(self, publisher: Any) -> None:
-        self.node.destroy_publisher(publisher)
 
     def _mend(self) -> None:
         plant = self.plant
@@ -206,9 +199,7 @@ class Campaign(Graph):
             self.compensator.process.kill()
             self.compensator.wait()
             out = Injected(max(self._changed_last() - began, 0.0))
-        self.start()
-        self.until_ready()
-        self.enable()
+        self.start_again()
         self.spin(LONGEST_S, self.follows, f'offsets that follow after: {name}')
         return out
 
@@ -235,8 +226,6 @@ WAY_OUT_S = 0.5
 ENABLINGS = 5
 DROOP = 0.005  # rad
 CREEP = 1e-9  # How far a command may be from the first one after ``ENABLINGS`` enablings, rad.
-
-
 Outcome = tuple[bool, str]
 """Whether the compensator did what it must, and with which figure."""
 
@@ -245,23 +234,20 @@ def _hold(graph: Graph, share: float) -> Outcome:
     """Enable against a controller that adds ``share`` of what it reports; the offsets must hold."""
     plant = graph.plant
     plant.share = share
-    graph.start()
-    graph.until_ready()
-    graph.enable()
+    graph.start_again()
     graph.spin(HOLDS_S, lambda: 'of its offset' in graph.compensator.text)
     held = 'of its offset' in graph.compensator.text
     largest = float(np.abs(plant.held).max())
     graph.enable(False)
     graph.spin(LONGEST_S, lambda: not plant.held.any(), 'no offset')
-    return (held, f'largest offset {largest * 1e3:.2f} mrad')
+    return held, f'largest offset {largest * 1e3:.2f} mrad'
 
 
 def _droop(graph: Graph) -> Outcome:
     """Enable again and again where servos droop; no step, and afterwards the command of before."""
     plant = graph.plant
     plant.droop, plant.commands = DROOP, True
-    graph.start('--output', 'commands')
-    graph.until_ready()
+    graph.start_again('--output', 'commands', enabled=False)
     for _ in range(ENABLINGS):
         count = len(plant.offsets)
         graph.enable()
@@ -269,14 +255,12 @@ def _droop(graph: Graph) -> Outcome:
         graph.enable(False)
         graph.spin(WAY_OUT_S + LONGEST_S / 10.0, lambda: float(np.abs(plant.held).max()) < CREEP)
     crept = float(np.abs(plant.held).max())
-    return (crept < CREEP, f'crept {crept * 1e3:.3g} mrad')
+    return crept < CREEP, f'crept {crept * 1e3:.3g} mrad'
 
 
 def _followed(graph: Graph, breaks: str = 'health') -> float:
     """Start and enable; return the largest offset, rad, as soon as it compensates the load."""
-    graph.start(breaks=breaks)
-    graph.until_ready()
-    graph.enable()
+    graph.start_again(breaks=breaks)
     graph.spin(LONGEST_S, lambda: graph.plant.error() < 1e-4, 'the rigid pose')
     return float(np.abs(graph.plant.held).max())
 
@@ -292,7 +276,7 @@ def _way_out(graph: Graph) -> Outcome:
     graph.flag.unlink()
     took, allowed = graph.plant.stamps[-1] - began, largest / MAX_RATE + WAY_OUT_S
     right = not graph.plant.held.any() and took <= allowed
-    return (right, f'released in {took * 1e3:.0f} ms of {allowed * 1e3:.0f} ms')
+    return right, f'released in {took * 1e3:.0f} ms of {allowed * 1e3:.0f} ms'
 
 
 def _restarted(graph: Graph) -> Outcome:
@@ -300,8 +284,7 @@ def _restarted(graph: Graph) -> Outcome:
     _followed(graph)
     graph.compensator.send(signal.SIGKILL)
     graph.compensator.wait()
-    graph.start()
-    graph.until_ready()
+    graph.start_again(enabled=False)
     graph.spin(HOLDS_S, lambda: 'the controller applies' in graph.compensator.text)
     reported, held = 'the controller applies' in graph.compensator.text, graph.plant.held.any()
     graph.enable(False)
@@ -359,14 +342,11 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     wanted = names if COMPENSATOR in args.only else [name for name in args.only if name in names]
     missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
-    wrong = CONTROLLER_FAULTS if CONTROLLER in args.only else [n for n in args.only if n in CONTROLLER_FAULTS]
-    for name in wrong:
+    for name in CONTROLLER_FAULTS if CONTROLLER in args.only else [n for n in args.only if n in CONTROLLER_FAULTS]:
         failed, step = controller_faults(name, args.times)
         missed, worst = missed + failed, max(worst, step)
-    if SHAPER in args.only:
-        worst = max(worst, shaper_faults(args.times))
-    if ACTION in args.only:
-        worst = max(worst, action_faults(args.times))
+    for name, faults in ((SHAPER, shaper_faults), (ACTION, action_faults)):
+        worst = max(worst, faults(args.times) if name in args.only else 0.0)
     return conclude(f'largest step of all: {worst:.3f} of what the rate allows', not missed and worst <= WITHIN)
 
 
@@ -387,12 +367,10 @@ def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
             slow += sum(r.released > r.allowed for r in released)
             step = campaign.plant.step(heard - 1)
             worst = max(worst, step)
-            print(
-                f'{name:24}{len(reactions):4} times (and {campaign.repeated} repeated): held after {_most(held)}; '
-                f'released in {_most([r.released for r in released])} '
-                f'of {_most([r.allowed for r in released])}; largest step {step:.3f} of max_rate * dt',
-                flush=True,
-            )
+            times_words = f'{len(reactions):4} times (and {campaign.repeated} repeated)'
+            took, may = (_most([getattr(r, word) for r in released]) for word in ('released', 'allowed'))
+            words = f'held after {_most(held)}; released in {took} of {may}; largest step {step:.3f} of max_rate * dt'
+            print(f'{name:24}{times_words}: {words}', flush=True)
     finally:
         campaign.close()
     print(f'held later than {HOLD_S * 1e3:g} ms: {late}; released later than offset/max_rate + 0.2 s: {slow}')

@@ -25,25 +25,17 @@ RATE = 1000
 SERIAL = 'CAMPAIGN-1'
 VOLTS_PER_COUNT = 10.0 / 32768
 DIGIT = 4096  # Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1.
-
 LOOK_S = 0.005
 QUIET_LOOKS = 5
 READ_LIMIT_S = 5.0
-
 Tamper = Callable[[int, bytes], bytes | None]
 """What becomes of a sample's frame on the line; None where it arrives as it is."""
 
 
 def hello_of(serial: str = SERIAL, rate: float = 1000.0) -> protocol.HelloFrame:
     """What the device says of itself."""
-    info: dict[str, object] = {
-        'serial': serial,
-        'firmware': 'campaign',
-        'sample_rate_hz': rate,
-        'channels': list(CHANNELS),
-        'volts_per_count': VOLTS_PER_COUNT,
-    }
-    return protocol.HelloFrame(1, info)
+    info: dict[str, object] = {'serial': serial, 'firmware': 'campaign', 'sample_rate_hz': rate}
+    return protocol.HelloFrame(1, {**info, 'channels': list(CHANNELS), 'volts_per_count': VOLTS_PER_COUNT})
 
 
 def identities(volts: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:

@@ -203,8 +203,7 @@ def attack(name: str, args: argparse.Namespace) -> int:
                 print(f'{name}:   {topic} {count}')
         finally:
             inside.close()
-    for fault in faults:
-        print(f'{name}: WRONG: {fault}')
+    print(*(f'{name}: WRONG: {fault}\n' for fault in faults), sep='', end='')
     return 1 if faults else 0
 
 

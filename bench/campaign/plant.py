@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.simulated_arm import SimulatedArm, largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
@@ -25,6 +27,7 @@ from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.records import FloatArray
 from tools.program import ROOT, Program
 
+NAMES = ('shoulder', 'elbow')
 NOMINAL = np.array([1.2, 0.6])
 LOAD = (0.0, 0.0, -40.0)  # N, at the end effector.
 PERIOD_S = 0.02
@@ -32,16 +35,11 @@ NOISE = 1e-6
 MAX_RATE, FOLLOW_ERROR = CompensatorSettings().max_rate, CompensatorSettings().follow_error
 LATE_S = 0.05
 """With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
-
 Notify = Callable[[Any], bool]
 
 
 def faithful(message: Any) -> bool:
     return True
-
-
-def silent(message: Any) -> bool:
-    return False
 
 
 def wrong(field: str, *values: Any, added: bool = False) -> Notify:
@@ -80,7 +78,7 @@ DEFLECTIONS: dict[str, tuple[Notify, str]] = {
     'not finite': (wrong(f'{PLACE}.x', math.nan), 'not finite'),
     'jump': (wrong(f'{PLACE}.x', 0.1, added=True), 'jumps by'),
     'stale': (by_seconds(-1.0), 'is older than'),
-    'silent': (silent, 'no deflection for'),
+    'silent': (lambda message: False, 'no deflection for'),
     '1e300': (wrong(f'{PLACE}.z', 1e300), 'more than the links can have'),
     'ten metres': (wrong(f'{PLACE}.z', 10.0), 'more than the links can have'),
     'denormal quaternion': (wrong('pose.pose.orientation', 0.0, 0.0, 0.0, 1e-200), 'no deflection for'),
@@ -96,6 +94,13 @@ JOINTS: dict[str, tuple[Notify, str]] = {
     'leaping joints': (leaps, 'leap by'),
     'joints at 1e300': (wrong('position', [1e300, 1e300]), 'no positions of the joints'),
 }
+
+
+def move_to(end: FloatArray, seconds: float) -> JointTrajectory:
+    """To rest at ``end``, rad, in that time."""
+    at = Duration(seconds=seconds).to_msg()
+    point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)
+    return JointTrajectory(joint_names=list(NAMES), points=[point])
 
 
 class Spun:
@@ -214,7 +219,6 @@ URDF = ROOT / 'config' / 'two_links.urdf'
 LONGEST_S = 60.0
 ASK_AGAIN_S = 5.0
 READY = 'once it is enabled'  # What the compensator logs when it can be enabled.
-
 BREAKS = """
 import sys, time
 from pathlib import Path
@@ -253,8 +257,12 @@ class Graph(Spun):
         )
         return self.compensator
 
-    def until_ready(self) -> None:
+    def start_again(self, *arguments: str, breaks: str = 'health', enabled: bool = True) -> None:
+        """Start the compensator, wait until it can be enabled, and enable it unless not ``enabled``."""
+        self.start(*arguments, breaks=breaks)
         self.spin(LONGEST_S, lambda: READY in self.compensator.text, 'the node')
+        if enabled:
+            self.enable()
 
     def enable(self, wanted: bool = True) -> None:
         client = self.node.create_client(SetBool, '/compensator/enable')

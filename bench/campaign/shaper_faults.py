@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 from rclpy.action import ActionClient
-from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from bench.campaign.plant import Spun
+from bench.campaign.plant import NAMES, Spun, move_to
 from bench.campaign.strange import Stranger
 from bench.simulated_arm import largest_step_in_time
 from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving
@@ -23,19 +22,20 @@ from psd_deflection.records import FloatArray
 from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, Program
 
-NAMES = ('shoulder', 'elbow')
 MOVE_S = 0.6
 LARGEST = 0.4  # Of a joint, rad.
 FASTEST = 1.5 * 2.0 * LARGEST / (MOVE_S - 0.1)
 """Of a cubic from one end to the other within the time that is left of it, rad/s."""
 STEP_S = 0.002
 LONGEST_S = 60.0
-
 Change = Callable[[Any], object]
 
 
-def _last(**fields: Any) -> Change:
+def unchanged(message: Any) -> None:
+    pass
 
+
+def _last(**fields: Any) -> Change:
     def change(message: Any) -> None:
         for name, value in fields.items():
             setattr(message.points[-1], name, value)
@@ -102,17 +102,25 @@ class Moved(Spun):
         if self.reports and len(self.stamps) % 5 == 0:
             self._joints.publish(JointState(name=list(NAMES), position=self.commands[-1].tolist()))
 
-    def move(self, change: Change = lambda message: None) -> None:
+    def move(self, change: Change = unchanged) -> None:
         """Give a trajectory to somewhere else, changed."""
-        end = self._rng.uniform(-LARGEST, LARGEST, 2).tolist()
-        at = Duration(seconds=MOVE_S).to_msg()
-        point = JointTrajectoryPoint(positions=end, velocities=[0.0, 0.0], time_from_start=at)
-        message = JointTrajectory(joint_names=list(NAMES), points=[point])
+        message = move_to(self._rng.uniform(-LARGEST, LARGEST, 2), MOVE_S)
         change(message)
         self.give(message)
 
     def give(self, message: Any) -> None:
         self.given.publish(message)
+
+    def replaced(self) -> None:
+        for _ in range(5):
+            self.move()
+            self.spin(float(self._rng.uniform(0.02, 0.2)))
+
+    def stopped(self, seconds: float, then: Callable[[], None] = lambda: None) -> None:
+        self.shaper.process.send_signal(signal.SIGSTOP)
+        then()
+        self.spin(seconds)
+        self.shaper.process.send_signal(signal.SIGCONT)
 
     def under_way(self) -> None:
         heard = self.heard
@@ -125,33 +133,23 @@ class Moved(Spun):
     def inject(self, name: str) -> None:
         self.under_way()
         heard = self.heard
-        if name in REJECTED:
-            self.move(REJECTED[name])
-            self.spin(0.2)
-            if self.heard != heard:
-                raise RuntimeError(f'{name}: was not rejected')
-        elif name == 'replaced again and again':
-            for _ in range(5):
-                self.move()
-                self.spin(float(self._rng.uniform(0.02, 0.2)))
-        elif name == 'joints not told':
-            self.reports = False
-            self.spin(1.5)
-            self.move()
-            self.spin(0.3)
+        if name in REJECTED or name == 'joints not told':
+            self.reports = name in REJECTED
+            self.spin(0.0 if self.reports else 1.5)
+            self.move(REJECTED.get(name, unchanged))
+            self.spin(0.2 if self.reports else 0.3)
             self.reports = True
             if self.heard != heard:
                 raise RuntimeError(f'{name}: was not rejected')
+        elif name == 'replaced again and again':
+            self.replaced()
         elif name == 'killed and started again':
             self.shaper.process.kill()
             self.shaper.wait()
             # The joints still move: it must begin when they stand.
             self.start()
         else:
-            self.shaper.process.send_signal(signal.SIGSTOP)
-            self.move()
-            self.spin(0.2)
-            self.shaper.process.send_signal(signal.SIGCONT)
+            self.stopped(0.2, self.move)
         self.under_way()
         self.spin(1.5)
 
@@ -172,11 +170,6 @@ def injected(moved: Moved, names: Sequence[str], times: int, label: str = 'shape
     finally:
         moved.close()
     return worst
-
-
-def shaper_faults(times: int) -> float:
-    """All of the topic; as :func:`injected`."""
-    return injected(Moved(), (*REJECTED, *OTHERS), times)
 
 
 OF_ACTION = (
@@ -232,46 +225,38 @@ class Followed(Moved):
         assert self._served is not None
         if name in REJECTED:
             super().inject(name)
-        elif name == 'strange goals':
+        elif name != 'goal replaced, shaper starved':
             self.under_way()
+        if name == 'strange goals':
             for _ in range(15):
                 self.move(self._strange)
                 self.spin(0.02)
         elif name == 'goal replaced':
-            self.under_way()
-            for _ in range(5):
-                self.move()
-                self.spin(float(self._rng.uniform(0.02, 0.2)))
+            self.replaced()
         elif name == 'goal replaced, shaper starved':
             # It is so late that it takes old feedback for the last, and forgets a motion that goes on.
             for _ in range(4):
                 self.move()
                 for _ in range(4):
-                    self.shaper.process.send_signal(signal.SIGSTOP)
-                    self.spin(0.09)
-                    self.shaper.process.send_signal(signal.SIGCONT)
+                    self.stopped(0.09)
                     self.spin(0.004)
         elif name == 'goal cancelled':
-            self.under_way()
             self.spin(LONGEST_S, self._sent[-1].done, 'an answer to a goal')
             self._sent[-1].result().cancel_goal_async()
             self.spin(float(self._rng.uniform(0.0, 0.3)))
             self.move()
         elif name == 'controller rejects':
-            self.under_way()
             self._served.rejects = True
             self.move()
             self.spin(0.2)
             self._served.rejects = False
         elif name == 'controller dies':
-            self.under_way()
             self._served.close()
             self._served = None
             self.controller.hold(time.time())
             self.spin(float(self._rng.uniform(0.0, 2.0)))
             self._served = ServedController(self.node, NAMES, self.controller)
-        else:
-            self.under_way()
+        elif name not in REJECTED:
             self._served.mute = True
             self._ended()
             self._served.mute = False
@@ -280,8 +265,13 @@ class Followed(Moved):
         self.spin(0.3)
 
 
+def shaper_faults(times: int) -> float:
+    """All of the topic; as :func:`injected`."""
+    return injected(Moved(), (*REJECTED, *OTHERS), times)
+
+
 def action_faults(times: int) -> float:
-    """As :func:`bench.campaign.shaper_faults.injected`."""
+    """All of the action; as :func:`injected`."""
     if not available():
         print('action: control_msgs is not installed and cannot be built: not tried')
         return 0.0

@@ -24,8 +24,6 @@ MAGIC = (
 )
 _SEQUENCE = re.compile(r'(?:sequence<(?P<of>.+?)(?:, \d+)?>|(?P<array>.+)\[(?P<count>\d+)\])$')
 _INTEGER = re.compile(r'(?P<sign>u?)int(?P<bits>\d+)$|(?P<byte>octet|byte|char)$')
-
-
 T = TypeVar('T', str, bytes)
 
 
@@ -76,8 +74,7 @@ class Stranger:
             return usual + self.chance.gauss(0.0, 0.02)
         if kind < 0.9:
             return self.chance.choice(NUMBERS)
-        (out,) = struct.unpack('<d', self.chance.randbytes(8))
-        return float(out)
+        return float(struct.unpack('<d', self.chance.randbytes(8))[0])
 
     def _stamp(self, value: Any) -> Any:
         chance = self.chance
@@ -110,9 +107,8 @@ class Stranger:
         if match is None:
             raise TypeError(f'{kind}: no field of this type can be made strange yet')
         bits = 8 if match['byte'] else int(match['bits'])
-        low, high = (
-            (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if match['sign'] == '' and not match['byte'] else (0, 2**bits - 1)
-        )
+        signed = match['sign'] == '' and not match['byte']
+        low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
         out = self.chance.choice((low, high, 0, 1, value + 1, value - 1, self.chance.randint(low, high)))
         clipped = max(low, min(high, out))
         return bytes([clipped]) if match['byte'] and isinstance(value, bytes) else clipped
@@ -151,14 +147,10 @@ class Stranger:
     def _of_another_length(self, of: str, out: list[Any]) -> list[Any]:
         chance = self.chance
         kind = chance.randrange(6)
-        if kind == 0 or not out:
-            return []
-        if kind == 1:
-            return out[:-1]
-        if kind == 2:
-            return [*out, chance.choice(out)]
-        if kind == 3:
-            return out[::-1]
+        if kind < 2 or not out:
+            return out[:-1] if kind == 1 else []
+        if kind < 4:
+            return [*out, chance.choice(out)] if kind == 2 else out[::-1]
         if kind == 4 and chance.random() < 0.02:
             return (out * chance.choice(HUGE))[: chance.choice(HUGE)]
         if '/' not in of:
@@ -171,14 +163,11 @@ class Stranger:
         kind = chance.randrange(7)
         if kind == 0 or not content:
             return chance.choice((b'', bytes(1), chance.randbytes(100)))
-        if kind == 1:
-            return content[: chance.randrange(len(content))]
-        if kind == 2:
-            return content + chance.randbytes(50)
-        if kind == 3:
-            return chance.choice(MAGIC) + chance.randbytes(chance.randrange(64))
-        if kind == 4:
-            return self._spliced(content)
+        if kind in (1, 2):
+            return content[: chance.randrange(len(content))] if kind == 1 else content + chance.randbytes(50)
+        if kind in (3, 4):
+            splices = kind == 4
+            return self._spliced(content) if splices else chance.choice(MAGIC) + chance.randbytes(chance.randrange(64))
         out = bytearray(content)
         for _ in range(chance.choice((1, 10, 1000))):
             # Of a JPEG the headers are at the start.

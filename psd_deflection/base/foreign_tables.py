@@ -30,12 +30,8 @@ SYNONYMS = {
 }
 UNITS = {
     'ns': 'nanoseconds: divide by 1e9',
-    'us': 'microseconds: divide by 1e6',
-    'µs': 'microseconds: divide by 1e6',
-    'μs': 'microseconds: divide by 1e6',
-    'micros': 'microseconds: divide by 1e6',
-    'ms': 'milliseconds: divide by 1000',
-    'millis': 'milliseconds: divide by 1000',
+    **dict.fromkeys(('us', 'µs', 'μs', 'micros'), 'microseconds: divide by 1e6'),
+    **dict.fromkeys(('ms', 'millis'), 'milliseconds: divide by 1000'),
     'mv': 'millivolts: divide by 1000',
     'µv': 'microvolts: divide by 1e6',
 }

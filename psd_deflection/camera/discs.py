@@ -293,8 +293,7 @@ class Discs(Target):
         around = 2.2 * self._radius
         places = (-self._spacing, 0.0, self._spacing)
         return Drawing(
-            size=(2 * around, 2 * (self._spacing + around)),
-            discs=tuple((0.0, y, self._radius) for y in places),
+            size=(2 * around, 2 * (self._spacing + around)), discs=tuple((0.0, y, self._radius) for y in places)
         )
 
     def rest_words(self, rest: TargetPose) -> list[str]:

@@ -224,12 +224,9 @@ def grey(image: Any) -> Any:
 
 
 _ENCODINGS = {
-    'mono8': (np.uint8, 1, ''),
-    '8UC1': (np.uint8, 1, ''),
-    'mono16': (np.uint16, 1, ''),
-    '16UC1': (np.uint16, 1, ''),
-    'bgr8': (np.uint8, 3, 'COLOR_BGR2GRAY'),
-    '8UC3': (np.uint8, 3, 'COLOR_BGR2GRAY'),
+    **dict.fromkeys(('mono8', '8UC1'), (np.uint8, 1, '')),
+    **dict.fromkeys(('mono16', '16UC1'), (np.uint16, 1, '')),
+    **dict.fromkeys(('bgr8', '8UC3'), (np.uint8, 3, 'COLOR_BGR2GRAY')),
     'rgb8': (np.uint8, 3, 'COLOR_RGB2GRAY'),
     'bgra8': (np.uint8, 4, 'COLOR_BGRA2GRAY'),
     'rgba8': (np.uint8, 4, 'COLOR_RGBA2GRAY'),

@@ -18,21 +18,8 @@ from psd_deflection.devices.port import SCHEMES
 SHELLS = ('bash', 'zsh', 'tcsh')
 
 FILES = (
-    'ARM.urdf',
-    'CHAIN.yaml',
-    'X.csv',
-    'X.parquet',
-    'REC',
-    'IN',
-    'FILE',
-    'OUT',
-    'RIG.yaml',
-    'CAMERA.yaml',
-    'FILE.yaml',
-    'FILE.png',
-    'FILE.png|svg|pdf',
-    'DIR|FILE.png|svg|pdf',
-    'PATH',
+    *('ARM.urdf', 'CHAIN.yaml', 'X.csv', 'X.parquet', 'REC', 'IN', 'FILE', 'OUT', 'RIG.yaml', 'CAMERA.yaml'),
+    *('FILE.yaml', 'FILE.png', 'FILE.png|svg|pdf', 'DIR|FILE.png|svg|pdf', 'PATH'),
 )
 FOLDERS = ('DIR', 'FOLDER', 'CALIBRATION')
 """Names of values in the help that are to be completed as paths; a bag is a folder, and completed as a file is."""

@@ -19,21 +19,9 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import PARAMETERS
 
 NEEDED = (
-    'source',
-    'port',
-    'link.length',
-    'link.outer_radius',
-    'link.inner_radius',
-    'link.youngs_modulus',
-    'link.shear_modulus',
-    'psd_1.center',
-    'psd_2.center',
-    'amplifier.sensitivity',
-    'amplifier.noise',
-    'converter.bits',
-    'converter.sample_rate_hz',
-    'dynamics.bending_frequency',
-    'dynamics.torsion_frequency',
+    *('source', 'port', 'link.length', 'link.outer_radius', 'link.inner_radius', 'link.youngs_modulus'),
+    *('link.shear_modulus', 'psd_1.center', 'psd_2.center', 'amplifier.sensitivity', 'amplifier.noise'),
+    *('converter.bits', 'converter.sample_rate_hz', 'dynamics.bending_frequency', 'dynamics.torsion_frequency'),
 )
 """Without these no rig but that of the thesis is described."""
 

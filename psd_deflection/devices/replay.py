@@ -109,13 +109,7 @@ class Replay(Source):
         numbers = (block.seq - self._begin_of(block)).tolist()
         events: list[Event] = [
             Sample(flags, seq, t, tuple(volts))
-            for flags, seq, t, volts in zip(
-                block.flags.tolist(),
-                numbers,
-                times,
-                block.volts.tolist(),
-                strict=True,
-            )
+            for flags, seq, t, volts in zip(block.flags.tolist(), numbers, times, block.volts.tolist(), strict=True)
         ]
         return Received(events, time.monotonic_ns(), max(1, block.volts.nbytes))
 

@@ -121,13 +121,7 @@ class Rfc2217Port(OpenPort):
     """
 
     def __init__(
-        self,
-        name: str,
-        address: Address,
-        baud: int,
-        *,
-        rtscts: bool = False,
-        given_up: threading.Event | None = None,
+        self, name: str, address: Address, baud: int, *, rtscts: bool = False, given_up: threading.Event | None = None
     ) -> None:
         super().__init__(name, given_up)
         host = f'[{address.host}]' if ':' in address.host else address.host

@@ -240,8 +240,7 @@ class LinesProbe:
                 psds = psds_of(item.info)
                 who = f'text lines, {item.info.get("serial", "no serial number")}'
                 return Answer(
-                    who if psds == 2 else f'{who}, {psds} PSDs',
-                    {'baud': self._baud, **converter_parameters(item.info)},
+                    who if psds == 2 else f'{who}, {psds} PSDs', {'baud': self._baud, **converter_parameters(item.info)}
                 )
             self.promising = self.promising or isinstance(item, Line)
         return None

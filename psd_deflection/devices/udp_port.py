@@ -63,11 +63,7 @@ class UdpPort(OpenPort):
     """A port on which datagrams come. Raises DeviceError with its name if it cannot be had."""
 
     def __init__(
-        self,
-        name: str,
-        address: Address,
-        datagrams: Datagrams | None = None,
-        given_up: threading.Event | None = None,
+        self, name: str, address: Address, datagrams: Datagrams | None = None, given_up: threading.Event | None = None
     ) -> None:
         super().__init__(name, given_up)
         try:

@@ -281,12 +281,7 @@ class OpticsHealth:
         return tuple(out)
 
 
-_ORDER = (
-    BlockStatus.LASER_LOST,
-    BlockStatus.SATURATED,
-    BlockStatus.FROZEN,
-    BlockStatus.OUTSIDE_ACTIVE_AREA,
-)
+_ORDER = (BlockStatus.LASER_LOST, BlockStatus.SATURATED, BlockStatus.FROZEN, BlockStatus.OUTSIDE_ACTIVE_AREA)
 
 
 class CalibratedRange:

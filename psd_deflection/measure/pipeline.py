@@ -118,14 +118,7 @@ class Pipeline:
     @property
     def _parts(self) -> tuple[Part, ...]:
         """Everything that has a state."""
-        parts = (
-            self._surroundings,
-            self._stillness,
-            self._loudness,
-            self.estimation,
-            self.tip_loads,
-            self.estimator,
-        )
+        parts = (self._surroundings, self._stillness, self._loudness, self.estimation, self.tip_loads, self.estimator)
         return parts if self.motion_filter is None else (*parts, self.motion_filter)
 
     def _new_filter(self) -> ModalFilter | None:

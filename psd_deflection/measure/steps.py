@@ -1,13 +1,15 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Steps of the dots that last, by means over whole bending periods on either side of a moment."""
+"""Steps of the dots that last, by means over whole bending periods on either side of a moment; and when the link moved
+last, by the dots of the last minute: a weight is noted after it was hung."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BlockStatus, FloatArray, Record, SpotMeans
 from psd_deflection.rig.config import Rig
 
 PERIODS = 4
@@ -16,6 +18,8 @@ STANDS_OUT = 10.0
 """Factor by which a step must exceed the median of what is there without one."""
 LEAST_SHARE = 0.03
 """A step is at least this share of the largest."""
+REACH_S = 60.0
+"""A step that is older is not looked for."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -97,3 +101,35 @@ def _difference(dots: FloatArray, after: slice, before: slice) -> FloatArray:
         good = part[np.isfinite(part).all(axis=1)]
         means.append(good.mean(axis=0) if len(good) else np.zeros(dots.shape[1]))
     return np.asarray(means[0] - means[1])
+
+
+class RecentDots:
+    """A sink of records. It keeps the dots of two PSDs for ``REACH_S`` and computes when asked."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._period = rig.estimator.block_size / rig.converter.sample_rate_hz
+        self._most = max(2, round(REACH_S / self._period))
+        self._rows: deque[tuple[int, int, tuple[float, ...]]] = deque(maxlen=self._most)
+
+    def put(self, record: Record) -> None:
+        """Keep the dots of a good block."""
+        if isinstance(record, SpotMeans) and record.status is BlockStatus.OK:
+            self._rows.append((record.index, record.t_ns, record.dots[:4]))
+
+    def step_ns(self) -> int | None:
+        """When the last lasting step of the dots was, ns, or None. From any thread."""
+        rows = tuple(self._rows)
+        if not rows:
+            return None
+        last, last_ns, _ = rows[-1]
+        # Blocks that are missing are rows without dots. After a restart numbers may begin anew.
+        first = max(min(index for index, _, _ in rows), last - self._most + 1)
+        dots = np.full((last - first + 1, 4), np.nan)
+        for index, _, values in rows:
+            if first <= index <= last:
+                dots[index - first] = values
+        step_s = last_load_change(self._rig, dots, self._period)
+        # Times are those of the middles of blocks; a step lies between two.
+        ago_s = None if step_s is None else (last - first + 0.5) * self._period - step_s
+        return None if ago_s is None else last_ns - round(ago_s * 1e9)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from psd_deflection.measure.pipeline import Pipeline, PipelineCounters
-from psd_deflection.recordings.formats.format import format_of_name
+from psd_deflection.recordings.formats.format import format_of_name, open_sink
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import replayed
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import (
     AppliedLoad,
     Mark,

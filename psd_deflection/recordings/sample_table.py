@@ -11,14 +11,7 @@ import numpy.typing as npt
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.tables import Column, Table, columns_of
-from psd_deflection.records import (
-    AppliedLoad,
-    FloatArray,
-    IntArray,
-    ReferencePose,
-    TemperatureReading,
-    channel_names,
-)
+from psd_deflection.records import AppliedLoad, FloatArray, IntArray, ReferencePose, TemperatureReading, channel_names
 
 LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
 TEMPERATURE_COLUMN = 'temperature'

@@ -54,10 +54,7 @@ from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, flattened, read_p
 from psd_deflection.rig.parameters import Parameter, Section, Value, check_value, shown
 from psd_deflection.rig.running import AcquisitionConfig, MonitorConfig
 
-_ORDERED = (
-    ('link.inner_radius', 'less than', 'link.outer_radius'),
-    ('sum_min', 'less than', 'sum_max'),
-)
+_ORDERED = (('link.inner_radius', 'less than', 'link.outer_radius'), ('sum_min', 'less than', 'sum_max'))
 BASE_SOLVER = 'base_pair'
 """The solver that alone says ``arrangement: base``."""
 _COMPARE = {'less than': operator.lt, 'at most': operator.le}

@@ -36,11 +36,7 @@ class LinkConfig:
     youngs_modulus: float = parameter(69e9, 'Pa', "Young's modulus E", above=0.0, maximum=1e13)
     shear_modulus: float = parameter(24e9, 'Pa', 'shear modulus G', above=0.0, maximum=1e13)
     slope_ratio: float = parameter(
-        1.5,
-        '',
-        'k of the tip slope, φ = -k ΔY/L: 3/2 for a tip force, 2 for a tip moment',
-        minimum=0.0,
-        maximum=10.0,
+        1.5, '', 'k of the tip slope, φ = -k ΔY/L: 3/2 for a tip force, 2 for a tip moment', minimum=0.0, maximum=10.0
     )
 
     @property
@@ -322,10 +318,7 @@ class EstimatorConfig:
 
 
 LINK = Section(LinkConfig, 'link.')
-PSDS = (
-    Section(PsdConfig, 'psd_1.', center=(0.0, 0.070)),
-    Section(PsdConfig, 'psd_2.', center=(-0.100, 0.0)),
-)
+PSDS = (Section(PsdConfig, 'psd_1.', center=(0.0, 0.070)), Section(PsdConfig, 'psd_2.', center=(-0.100, 0.0)))
 BEAMS = (Section(BeamConfig, 'beam_1.'), Section(BeamConfig, 'beam_2.'))
 MORE_PSDS = tuple((Section(PsdConfig, f'psd_{n}.'), Section(BeamConfig, f'beam_{n}.')) for n in range(3, MOST_PSDS + 1))
 """PSDs that a rig may have, each with its beam: it has those whose ``center`` is given."""

@@ -90,13 +90,7 @@ class Allowed(TypedDict, total=False):
 
 
 def parameter(
-    default: T,
-    unit: str,
-    description: str,
-    *,
-    name: str = '',
-    live: bool = False,
-    **allowed: Unpack[Allowed],
+    default: T, unit: str, description: str, *, name: str = '', live: bool = False, **allowed: Unpack[Allowed]
 ) -> T:
     """Declare a parameter as a field of a dataclass; the field's type is its type.
 

@@ -49,9 +49,7 @@ class AcquisitionConfig:
     )
     keep_zero: bool = parameter(True, '', '~/zero holds for later runs with the same device as well')
     zero_file: str = parameter(
-        '',
-        '',
-        'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
+        '', '', 'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection'
     )
     realtime: bool = parameter(
         False, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'

@@ -35,10 +35,9 @@ from msg_adapters import END_EFFECTOR
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import NO_TIP, Arm, arm_of, read_arm
 from psd_deflection.arms.compensation.compensator import Command, Compensator, Observed, State
-from psd_deflection.arms.compensation.robot import RobotWatch
 from psd_deflection.arms.compensation.settings import ALL_JOINTS, SETTINGS, CompensatorSettings
 from psd_deflection.arms.compensation.settings import COMMANDS as WITH_COMMANDS
-from psd_deflection.arms.inputs import LARGEST_POSITION, joints_fault
+from psd_deflection.arms.inputs import LARGEST_POSITION, RobotWatch, joints_fault
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.records import FloatArray

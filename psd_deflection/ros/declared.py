@@ -58,10 +58,7 @@ def declare(node: Node, parameter: Parameter, value: Value, shown: ParameterDesc
     node.set_parameters([RosParameter(parameter.name, kind, [])])
 
 
-_EMPTY = {
-    'double_array': (RosParameter.Type.DOUBLE_ARRAY, 0.0),
-    'string_array': (RosParameter.Type.STRING_ARRAY, ''),
-}
+_EMPTY = {'double_array': (RosParameter.Type.DOUBLE_ARRAY, 0.0), 'string_array': (RosParameter.Type.STRING_ARRAY, '')}
 
 
 class UnknownParameterError(ParameterNotDeclaredException):  # type: ignore[misc]

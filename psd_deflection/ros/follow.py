@@ -76,12 +76,7 @@ class Follower:
     """
 
     def __init__(
-        self,
-        owner: BaseNode[Any],
-        action: str,
-        shape: Shape,
-        shaper: TrajectoryShaper,
-        joints_fault: Callable[[], str],
+        self, owner: BaseNode[Any], action: str, shape: Shape, shaper: TrajectoryShaper, joints_fault: Callable[[], str]
     ) -> None:
         self._owner, self._shape, self._shaper, self._joints_fault = owner, shape, shaper, joints_fault
         self.taken = 0

@@ -64,12 +64,7 @@ class InputGate:
         self.why: BoundedMap[str, str] = BoundedMap()
 
     def listen(
-        self,
-        topic: str,
-        check: Callable[[Any], str],
-        take: Callable[[Any], None],
-        name: str = '',
-        type_name: str = '',
+        self, topic: str, check: Callable[[Any], str], take: Callable[[Any], None], name: str = '', type_name: str = ''
     ) -> list[Subscription]:
         """Subscribe to ``topic``, by its first row: ``take`` gets each message that ``check`` finds nothing wrong with.
 

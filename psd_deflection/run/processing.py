@@ -87,11 +87,7 @@ class Processing:
     """
 
     def __init__(
-        self,
-        items: ItemQueue,
-        pipeline: Pipeline,
-        log: LogCallback,
-        clock: Callable[[], int] = time.monotonic_ns,
+        self, items: ItemQueue, pipeline: Pipeline, log: LogCallback, clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.pipeline = pipeline
         self.sinks: list[RecordSink] = []

@@ -29,8 +29,8 @@ from psd_deflection.run.realtime import lock_memory, of_systemd
 from psd_deflection.run.recorder import Recorder
 from psd_deflection.run.session_texts import RETAKE_ZERO, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
+from psd_deflection.run.state import ZeroStore
 from psd_deflection.run.watcher import Watcher, WatcherSink
-from psd_deflection.run.zero_store import ZeroStore
 
 STALLED_S = 5.0
 """A thread that has completed no round for this long hangs: the watchdog gets no more signals."""

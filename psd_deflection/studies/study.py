@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The shape of every study: recordings give a frozen problem of arrays (``from_recordings.py``), a function of the
+"""The shape of every study: recordings give a frozen problem of arrays (``read_NAME``), a function of the
 study's name takes it and gives a :class:`StudyResult`, which says, shows and writes itself: answer, sections, what it
 is of."""
 

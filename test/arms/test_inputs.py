@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from psd_deflection.arms.compensation.robot import RobotWatch
-from psd_deflection.arms.inputs import KNOWN_S, LONGEST_LIST, KnownJoints, joints_fault
+from psd_deflection.arms.inputs import KNOWN_S, LONGEST_LIST, KnownJoints, RobotWatch, joints_fault
 
 
 def test_positions_are_known_for_a_while() -> None:

@@ -262,8 +262,8 @@ NOT_OF_A_BLOCK = {
     ('measure/averaging.py', 'middles_ns'): 'adds whole numbers',
     ('measure/uncertainty/noise.py', '_autocovariance'): 'adds whole numbers',
     ('measure/health.py', '__init__'): 'a whole number to the power of one',
-    ('measure/uncertainty/outliers.py', '__init__'): 'the suspect is told in /diagnostics alone',
-    ('measure/uncertainty/outliers.py', 'add'): 'the suspect is told in /diagnostics alone',
+    ('measure/uncertainty/consistency.py', '__init__'): 'the suspect is told in /diagnostics alone',
+    ('measure/uncertainty/consistency.py', 'add'): 'the suspect is told in /diagnostics alone',
     ('measure/uncertainty/block_estimator.py', 'noise_words'): 'told in /diagnostics alone',
 }
 MATRICES = {'linalg', 'fft', 'einsum', 'dot', 'vdot', 'inner', 'matmul', 'tensordot', 'trace', 'polyfit', 'convolve'}

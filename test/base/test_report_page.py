@@ -20,7 +20,6 @@ from test.run.monitor.browsing import Page
 from tools.accessible import views, violations
 
 pytestmark = pytest.mark.browser
-
 X = np.arange(101.0)
 KEYS = '[...document.querySelectorAll("button.key")]'
 

@@ -18,7 +18,6 @@ from bench.rows import read
 from psd_deflection.rig.config import Rig, load_rig
 
 pytestmark = pytest.mark.slow
-
 ROOT = Path(__file__).resolve().parents[2]
 FOUND = sorted((ROOT / 'test' / 'data' / 'fuzz').glob('*'))
 

@@ -19,7 +19,7 @@ from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.print_target import printed
+from psd_deflection.camera.pictures import printed
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import SETTINGS, TARGETS, CameraSettings, target_class
 from psd_deflection.camera.target import Target, target_of

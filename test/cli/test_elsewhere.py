@@ -14,7 +14,6 @@ import pytest
 from psd_deflection.cli.main import COMMANDS
 
 pytestmark = pytest.mark.slow
-
 ROOT = Path(__file__).resolve().parents[2]
 ELSEWHERE = """
 import importlib.abc, os, select, signal, sys
@@ -62,8 +61,6 @@ STEPS = [
     ['budget'],
 ]
 """From a simulated recording to its studies, in turn."""
-
-
 WITHOUT = pytest.param(('-c', ELSEWHERE), marks=ON_UNIX, id='without Unix')
 AS_IT_IS = pytest.param(('-m', 'psd_deflection'), id='as it is')
 

@@ -59,7 +59,6 @@ def test_the_sketch_is_of_twenty_lines_and_describes_itself() -> None:
 
 EMULATOR = Path(__file__).parent / 'second_device.py'
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'protocol.md'
-
 COOKIE = 0x0102030405060708
 EXAMPLES: list[frames.GoodFrame] = [
     frames.HelloRequestFrame(),

@@ -29,7 +29,6 @@ from psd_deflection.run.arrivals import Arrival, Ended, Item
 from test.heard import WAIT_S
 
 pytestmark = pytest.mark.slow
-
 VOLTS = (0.1, 0.2, 5.0, 0.3, 0.4, 5.0)
 
 

@@ -59,7 +59,6 @@ from psd_deflection.records import (
 from .making import T0, block, estimate, run, spots
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-
 times = st.integers(0, 2**31 * 10**9 - 1)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 

@@ -16,7 +16,6 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROOT = Path(__file__).resolve().parents[2]
-
 ADAPTER = '''
 """test_msgs/Humidity: percent."""
 
@@ -47,7 +46,6 @@ def from_humidity(h: Humidity) -> Fields:
 def to_humidity(fields: Mapping[str, Any]) -> Humidity:
     return Humidity(stamp_ns(fields), fields['percent'])
 '''
-
 PRODUCER = """
 import sys
 from msg_adapters import INPUTS, TOPIC_TYPES, from_fields, humidity

@@ -28,7 +28,6 @@ from psd_deflection.rig.config import load_rig
 from .making import T0, block, run
 
 pytestmark = pytest.mark.slow
-
 HELLO = {'serial': 'A1', 'firmware': '1.2', 'sample_rate_hz': 1000, 'channels': ['x1', 'y1']}
 
 

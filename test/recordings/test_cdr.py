@@ -17,10 +17,8 @@ from msg_adapters.message_type import Constant, MessageType
 from psd_deflection.recordings import cdr
 
 pytestmark = pytest.mark.slow
-
 STORE = get_typestore(Stores.ROS2_JAZZY)
 CLOUD = 'sensor_msgs/msg/PointCloud2'
-
 FULL = {'int32': (-(2**31), 2**31 - 1), 'uint32': (0, 2**32 - 1), 'uint8': (0, 255), 'byte': (0, 255)}
 
 

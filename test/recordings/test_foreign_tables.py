@@ -21,7 +21,6 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import ReadingsTable, read_references
 
 pytestmark = pytest.mark.foreign
-
 CAMERA = optional('psd_deflection.camera.footage')
 NAMES = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
 HEADER = ','.join(('t', *NAMES))

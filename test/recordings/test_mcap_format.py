@@ -24,7 +24,6 @@ CHANNELS = st.builds(
     Channel, id=U16, schema_id=U16, topic=TEXTS, encoding=TEXTS, metadata=st.dictionaries(TEXTS, TEXTS, max_size=3)
 )
 METADATA = st.builds(Metadata, name=TEXTS, metadata=st.dictionaries(TEXTS, TEXTS, max_size=3))
-
 Call = tuple[str, tuple[Any, ...]]
 CALLS = st.lists(
     st.tuples(st.just('message'), st.tuples(st.integers(1, 3), U64, st.binary(max_size=50), U64, U32))

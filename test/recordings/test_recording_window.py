@@ -27,6 +27,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.charts import estimates_chart, moments, samples_chart
 from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.recordings.estimates import EstimateSeries
+from psd_deflection.recordings.formats.format import open_sink
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.replay.comparison import ReplayComparison
@@ -34,7 +35,6 @@ from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.recordings.sample_table import digest_of, sample_dtype, samples_table
 from psd_deflection.recordings.spans import span_ns
 from psd_deflection.recordings.write.bag_writer import BagWriter
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Mark, ParameterChange, ReferencePose, TemperatureReading
 from psd_deflection.studies.study import opened
 from tools.program import ROOT

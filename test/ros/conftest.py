@@ -30,9 +30,7 @@ WARNINGS = "error,ignore:module 'sre_parse' is deprecated:DeprecationWarning,"
 WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
 
 BLOCK_NS = 20_000_000
-
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
 ASK_AGAIN_S = 20.0
 """An answer that has not come by then is lost."""
 SEND_AGAIN_S = 1.0

@@ -23,7 +23,6 @@ from test.ros.conftest import BLOCK_NS, stamp
 from tools.program import ROOT, Program
 
 pytestmark = pytest.mark.ros
-
 EXAMPLE = ROOT / 'config' / 'two_links.yaml'
 
 

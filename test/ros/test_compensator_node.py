@@ -30,11 +30,9 @@ from test.ros.conftest import LATCHED
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
-
 STALE = '0.8'
 """s. On a busy machine this process is late too; test/arms/compensation has the default of 0.08 s."""
 ARGUMENTS = ('compensator', '--urdf', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive', '--stale', STALE)
-
 HANGS = """
 import sys
 from pathlib import Path
@@ -49,8 +47,6 @@ CompensatorNode._enable = lambda *words: (first if words[1].data else hang)(*wor
 sys.exit(main())
 """
 """Our program, whose main thread waits for input without end when the offsets are to be released."""
-
-
 Launch = Callable[..., Program]
 
 

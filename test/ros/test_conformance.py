@@ -45,7 +45,6 @@ from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
-
 ROS = ROOT / 'psd_deflection' / 'ros'
 NAMESPACE = '/left'
 GRAPH = ('/rosout', '/parameter_events', '/diagnostics', '/tf', '/tf_static', '/clock')

@@ -39,8 +39,6 @@ from psd_deflection.ros.endpoints import publisher_of
 from test.ros.conftest import BLOCK_NS, Peer, stamp
 
 pytestmark = pytest.mark.ros
-
-
 TOPICS = {
     '/link_tip/deflection': 'geometry_msgs/msg/PoseStamped',
     '/link_tip/deflection_with_covariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',

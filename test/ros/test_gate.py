@@ -21,7 +21,6 @@ from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic
 from test.ros.test_conformance import nodes_of_setup
 
 pytestmark = pytest.mark.ros
-
 TOPIC = '/said'
 KEPT = Delivery(50)
 

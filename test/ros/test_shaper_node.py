@@ -32,7 +32,6 @@ from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
 pytestmark = pytest.mark.ros
-
 ZVD = ('--frequency', str(FREQUENCY), '--damping-ratio', str(RATIO), '--shaper', 'zvd')
 URDF = ROOT / 'config' / 'two_links.urdf'
 
@@ -489,7 +488,6 @@ def test_what_rclpy_cannot_take_is_rejected(control_msgs: None, peer: Peer, monk
     rejected: list[str] = []
     node = rclpy.create_node('served', context=peer.context)
     server = GuardedServer(node, FollowJointTrajectory, '/goals', rejected.append, print, print, print)
-
     broken = Mock(side_effect=UnicodeDecodeError('utf-8', b'x', 0, 1, '/a/path of the library'))
     monkeypatch.setattr(rclpy.action.ActionServer, 'take_data', broken)
     assert server.take_data() == {}

@@ -29,7 +29,6 @@ from psd_deflection.run.realtime import Signals, StopRequestedError
 from tools import control_msgs
 
 pytestmark = pytest.mark.ros
-
 AT_NS = 5_000_000_007
 
 

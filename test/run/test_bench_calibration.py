@@ -16,7 +16,6 @@ from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
 from tools.program import ROOT
 
 RIG_FILE = ROOT / 'config' / 'thesis_rig.yaml'
-
 LOADS = [(0, 0, 0), (30, 0, 0), (0, -50, -29), (0, 0, 0), (-40, 40, 20)]
 SHARES = (0.02, 0.6, 1.0)
 """How much of the recording is there at each look that finds it grown."""

@@ -20,7 +20,6 @@ from test.heard import WAIT_S
 from test.run.conftest import ScriptedDevice
 
 Sample = Callable[..., SampleFrame]
-
 CHAIN = """
 links:
   - {name: upper, port: PORT_0, joint: {name: shoulder, axis: [0, 1, 0]}}

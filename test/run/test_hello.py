@@ -37,7 +37,6 @@ from test.heard import WAIT_S
 from test.run.conftest import HELLO, Estimates, ScriptedDevice
 
 pytestmark = pytest.mark.slow
-
 VOLTS = 10.0 / 32768
 GOOD = HELLO.info
 HUGE = 10**308 * 10
@@ -283,10 +282,8 @@ def test_a_device_with_as_many_psds_is_taken() -> None:
 
 
 Sample = Callable[..., SampleFrame]
-
 STARTS = [(3000, 205), (2**31 + 7, 193), (5, 200), (4_000_000_000, 120), (3_999_999_870, 110)]
 """First number and samples of each run of the device: most begin or end amid a block, the last one ends with one."""
-
 SENT = sum(n for _, n in STARTS)
 BLOCKS = Counter((run, number // 20) for run, (first, n) in enumerate(STARTS) for number in range(first, first + n))
 ESTIMATES = sum(samples >= load_rig().estimator.min_samples for samples in BLOCKS.values())

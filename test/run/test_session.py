@@ -28,7 +28,7 @@ from psd_deflection.run.monitor.metrics import text_of
 from psd_deflection.run.monitor.shown import RejectedError, ShownSession
 from psd_deflection.run.rate_limited_log import RateLimitedLog
 from psd_deflection.run.session import Session
-from psd_deflection.run.zero_store import ZeroStore
+from psd_deflection.run.state import ZeroStore
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
 

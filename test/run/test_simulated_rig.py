@@ -13,11 +13,11 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log
 from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.steps import REACH_S, RecentDots
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.recordings.replay.engine import replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, Record, SpotMeans
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.last_load_change import REACH_S, RecentDots
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 

@@ -32,7 +32,6 @@ from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
 
 pytestmark = pytest.mark.slow
-
 START_NS = 1_700_000_000_000_000_000
 
 

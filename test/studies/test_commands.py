@@ -17,7 +17,6 @@ from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 
 pytestmark = pytest.mark.slow
-
 RIG = Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml'
 HIDDEN = [
     *('--effect', 'sensor_rotation,psd=2,angle=0.012', '--effect', 'plane_tilt,slope_ratio=1.6'),

@@ -36,28 +36,13 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import ACQUISITION, MONITOR
 
 FIELDS = (
-    ERROR,
-    Field('complete', bool),
-    Field('bytes', int, 'B'),
-    Field('start_ns', int, 'ns'),
+    *(ERROR, Field('complete', bool), Field('bytes', int, 'B'), Field('start_ns', int, 'ns')),
     Field('duration_s', float, 's'),
-    Field('samples', int),
-    Field('lost', int),
-    Field('flagged', int),
-    Field('restarts', int),
-    Field('clock_steps', str),
-    Field('squeezed', int),
-    Field('sample_rate_hz', float, 'Hz'),
-    Field('blocks', int),
-    Field('block_size', int),
-    Field('namespace', str),
-    Field('node', str),
-    Field('version', str),
-    Field('lacks', str),
-    Field('warnings', str),
-    Field('marks', str),
-    Field('topics', str),
-    Field('parameters', str),
+    *(Field(name, int) for name in ('samples', 'lost', 'flagged', 'restarts')),
+    *(Field('clock_steps', str), Field('squeezed', int), Field('sample_rate_hz', float, 'Hz')),
+    *(Field('blocks', int), Field('block_size', int)),
+    *(Field(name, str) for name in ('namespace', 'node', 'version', 'lacks')),
+    *(Field(name, str) for name in ('warnings', 'marks', 'topics', 'parameters')),
 )
 """Columns of --out. ``marks``, ``clock_steps``, ``topics`` and ``parameters`` are JSON."""
 

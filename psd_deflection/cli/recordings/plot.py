@@ -340,8 +340,7 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
             traces[3].plot(t, table[key], color=color, linewidth=0.9, label=key, rasterized=raster)
         traces[3].axhline(rig.estimator.sum_min, color=COLORS['quiet'], linestyle=':', linewidth=1)
         traces[3].set(
-            ylabel='sum (V)',
-            ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, *(np.nanmax(table[key]) for key in sums))),
+            ylabel='sum (V)', ylim=(0.0, 1.2 * max(rig.amplifier.sum_nominal, *(np.nanmax(table[key]) for key in sums)))
         )
         traces[3].legend(loc='center right', fontsize=8, ncols=len(sums))
         if inputs.loads:

@@ -44,7 +44,7 @@ from psd_deflection.cli._values import given_as_option
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import alarm_sentences
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.formats.format import Sink
+from psd_deflection.recordings.formats.format import Sink, open_sink
 from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.replay.comparison import ReplayComparison
 from psd_deflection.recordings.replay.engine import (
@@ -57,7 +57,6 @@ from psd_deflection.recordings.replay.engine import (
 )
 from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.write.parquet import ENDING, Field, ParquetFile, is_parquet
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.alarm_out import AlarmOut
@@ -358,13 +357,7 @@ def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
         summary = done.summary()
         compared = summary.pop('compared')
         print_json(
-            {
-                'recording': str(path),
-                **summary,
-                'replay_seconds': done.seconds,
-                'out': args.out,
-                'compared': compared,
-            }
+            {'recording': str(path), **summary, 'replay_seconds': done.seconds, 'out': args.out, 'compared': compared}
         )
         return
     show(

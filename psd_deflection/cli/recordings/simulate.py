@@ -36,9 +36,8 @@ from psd_deflection.devices.registry import SIMULATED
 from psd_deflection.devices.serve import Hand, HostSide, open_sockets, serve_all, simulated_devices, stopped_by_signals
 from psd_deflection.model.simulation.catalogue import effects_of_rig, with_effects
 from psd_deflection.model.simulation.loads import HELP, CyclicLoads, load_histories, temperature_history
-from psd_deflection.recordings.formats.format import format_of_name
+from psd_deflection.recordings.formats.format import format_of_name, open_sink
 from psd_deflection.recordings.replay.simulated_recording import BAG_START_NS, SimulatedRun
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, ReferencePose, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import load_rig
 
@@ -145,11 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--temperature', metavar='T0[,T1...]', help='°C, straight lines through these, evenly spread over the recording'
     )
     group.add_argument(
-        '--effect',
-        metavar='NAME,KEY=VALUE,...',
-        action='append',
-        default=[],
-        help='add a hidden effect; repeatable',
+        '--effect', metavar='NAME,KEY=VALUE,...', action='append', default=[], help='add a hidden effect; repeatable'
     )
     group.add_argument(
         '--true-pose',

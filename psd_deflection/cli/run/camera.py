@@ -36,8 +36,7 @@ from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.footage import Footage, Frame, read_image, read_settings
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.opencv import opencv
-from psd_deflection.camera.preview import preview
-from psd_deflection.camera.print_target import printed
+from psd_deflection.camera.pictures import preview, printed
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import TARGETS, CameraSettings
 from psd_deflection.camera.target import target_of
@@ -45,7 +44,7 @@ from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder, picture_name, recording_name, require_ros
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.cli._values import integer
-from psd_deflection.recordings.write.sinks import open_reference_file
+from psd_deflection.recordings.formats.format import open_reference_file
 
 PREVIEW_S = 1.0
 

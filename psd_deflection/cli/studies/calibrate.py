@@ -126,14 +126,8 @@ def _reject_mixed(args: argparse.Namespace) -> None:
     if args.live:
         if args.recordings or args.span != FULL:
             raise UsageError('REC, --from, --to: --live makes a recording of its own and takes all of it')
-        made: dict[str, object] = {
-            'check': None,
-            'each': False,
-            'executor': None,
-            'reference': [],
-            'dark': [],
-            'namespace': None,
-        }
+        made: dict[str, object] = {'check': None, 'each': False, 'executor': None, 'reference': []}
+        made |= {'dark': [], 'namespace': None}
         reject(args, made, 'is for recordings that are there: --live makes its own')
     elif args.url is not None:
         raise UsageError('--url: is for --live')

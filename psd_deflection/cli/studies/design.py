@@ -276,11 +276,7 @@ def design_json(rig: Rig, candidates: list[PlacementRow], sigma: float) -> dict[
         },
         'sigma': sigma,
         'placements': [
-            {
-                'name': name,
-                'centers': centers.tolist(),
-                'sd': _deviation(centers, sigma)._asdict(),
-            }
+            {'name': name, 'centers': centers.tolist(), 'sd': _deviation(centers, sigma)._asdict()}
             for name, centers in candidates
         ],
     }

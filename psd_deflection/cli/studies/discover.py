@@ -67,11 +67,11 @@ from psd_deflection.cli._values import given_as_option, integer, seed
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names, with_effects
 from psd_deflection.model.simulation.loads import load_history
+from psd_deflection.recordings.formats.format import open_sink
 from psd_deflection.recordings.observation import Observation, read_observation
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRun
 from psd_deflection.recordings.spans import FULL
 from psd_deflection.recordings.write.parquet import ERROR, Field
-from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.conclusion import adopting_folder
@@ -217,18 +217,10 @@ STEPS = 8
 Planning and further searches go on at its end."""
 
 FIELDS = (
-    ERROR,
-    Field('verdict', str),
-    Field('effects', str),
-    Field('unknown', int),
-    Field('setup', str),
-    Field('gap_before', float, 'm'),
-    Field('gap_after', float, 'm'),
-    Field('gap_floor', float, 'm'),
-    Field('heldout_before', float, 'm'),
-    Field('heldout_after', float, 'm'),
-    Field('simulations', int),
-    Field('result', str),
+    *(ERROR, Field('verdict', str), Field('effects', str), Field('unknown', int), Field('setup', str)),
+    *(Field(f'gap_{name}', float, 'm') for name in ('before', 'after', 'floor')),
+    *(Field(f'heldout_{name}', float, 'm') for name in ('before', 'after')),
+    *(Field('simulations', int), Field('result', str)),
 )
 """Columns of --each. ``result`` is the content of result.json."""
 
@@ -247,11 +239,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--seed', type=seed, default=0, help='seed of the bootstraps; the same gives the same answer (default 0)'
     )
     parser.add_argument(
-        '--without',
-        metavar='EFFECT',
-        action='append',
-        default=[],
-        help='do not consider this effect; repeatable',
+        '--without', metavar='EFFECT', action='append', default=[], help='do not consider this effect; repeatable'
     )
     parser.add_argument(
         '--isolable', metavar='LOADS', help='without REC: which effects a recording under these loads could tell apart'

@@ -16,8 +16,7 @@ import argparse
 
 from psd_deflection.cli._progress import stage
 from psd_deflection.cli.studies._answer import answer, answer_arguments, opened_recording, progress, recording_arguments
-from psd_deflection.studies.identify.from_recordings import read_identify
-from psd_deflection.studies.identify.identify import identify
+from psd_deflection.studies.identify.identify import identify, read_identify
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,8 +20,7 @@ from psd_deflection.cli._progress import stage
 from psd_deflection.cli._values import number
 from psd_deflection.cli.studies._answer import answer, answer_arguments, opened_recording, progress, recording_arguments
 from psd_deflection.model.solvers.registry import SOLVERS
-from psd_deflection.studies.validate.from_recordings import ALL, read_validate
-from psd_deflection.studies.validate.validate import validate
+from psd_deflection.studies.validate.validate import ALL, read_validate, validate
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

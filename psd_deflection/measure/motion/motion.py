@@ -273,13 +273,7 @@ class ModalFilter:
         self._swung = self._swung + more[:, -1]
         self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
 
-    def _update(
-        self,
-        slots: IntArray,
-        poses: FloatArray,
-        pushed: Pushed | None,
-        forced: Forced | None,
-    ) -> None:
+    def _update(self, slots: IntArray, poses: FloatArray, pushed: Pushed | None, forced: Forced | None) -> None:
         gains = self._tables.gains(slots)
         predicted = self._xp.einsum('ani,ai->an', gains.observed, self._x)
         after = self._xp.einsum('aij,aj->ai', self._tables.phi, self._x)

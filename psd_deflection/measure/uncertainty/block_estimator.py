@@ -17,9 +17,14 @@ from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.measure.uncertainty.block_fit import FittedBlock
 from psd_deflection.measure.uncertainty.combinations import Residual
-from psd_deflection.measure.uncertainty.consistency import UNMEASURED, ConsistencyResult, Unexplained, survival
+from psd_deflection.measure.uncertainty.consistency import (
+    UNMEASURED,
+    ConsistencyResult,
+    OutlierSearch,
+    Unexplained,
+    survival,
+)
 from psd_deflection.measure.uncertainty.noise import StreamNoise
-from psd_deflection.measure.uncertainty.outliers import OutlierSearch
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.measure.uncertainty.vibration import Hum, Tone, words_of
 from psd_deflection.model.detector import dot_noise_variances

@@ -40,14 +40,7 @@ class Geometry:
         """The geometry that ``psd_N.center``, ``.zero``, ``.height`` and ``link`` of a parameter file
         describe.
         """
-        return cls(
-            rig.centers,
-            rig.zeros,
-            rig.heights,
-            rig.link.length,
-            rig.link.slope_ratio,
-            FIXED,
-        )
+        return cls(rig.centers, rig.zeros, rig.heights, rig.link.length, rig.link.slope_ratio, FIXED)
 
     @property
     def beams(self) -> FloatArray:

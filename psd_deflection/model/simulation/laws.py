@@ -147,10 +147,7 @@ FORMS: Mapping[str, Form] = {
     'drag': Form('rate', 'd({v})/dt |d({v})/dt|', following=law_forms.drag, unit_of_v=2, per_second=2),
     'direction': Form('history', 'sign of the last change of {v}', following=law_forms.direction, unit_of_v=0),
     'relaxed': Form(
-        'history',
-        '{v} through a lag of {tau}',
-        following=law_forms.relaxed,
-        fitted={'tau': ('s', 1e-4, 1e5)},
+        'history', '{v} through a lag of {tau}', following=law_forms.relaxed, fitted={'tau': ('s', 1e-4, 1e5)}
     ),
     'play': Form(
         'history', 'play({v}, {half_width}) - {v}', following=law_forms.played, fitted={'half_width': ('v', *_POSITIVE)}
@@ -478,10 +475,4 @@ def _tree(law: Law) -> dict[str, Any]:
         if t.sd:
             body['sd'] = {k: float(f'{v:.3g}') for k, v in t.sd.items()}
         terms.append(body)
-    return {
-        'stage': law.stage,
-        'acts_on': law.acts_on,
-        'kind': law.kind,
-        'expression': law.expression,
-        'terms': terms,
-    }
+    return {'stage': law.stage, 'acts_on': law.acts_on, 'kind': law.kind, 'expression': law.expression, 'terms': terms}

@@ -76,11 +76,7 @@ def ramp(
 
 
 def chirp(
-    amplitude: tuple[float, float, float],
-    f0: float,
-    f1: float,
-    duration: float,
-    rate: float = 1000.0,
+    amplitude: tuple[float, float, float], f0: float, f1: float, duration: float, rate: float = 1000.0
 ) -> LoadHistory:
     """A sine whose frequency rises steadily from ``f0`` to ``f1`` Hz."""
     t = np.arange(_count(duration, rate)) / rate
@@ -101,18 +97,9 @@ def identification(rate: float = 1000.0) -> LoadHistory:
     Steps of weight on the sidebar and on the link, pulls along X, torque both ways, back through
     the same levels (hysteresis), and a chirp through both modes.
     """
-    levels = [
-        (0.0, 0.0, 0.0),
-        sidebar(30.0),
-        sidebar(50.0),
-        sidebar(10.0),
-        (0.0, 0.0, 0.0),
-        direct(50.0),
-        (30.0, 0.0, 0.0),
-        (-20.0, -20.0, 15.0),
-        (0.0, 20.0, 25.0),
-        (0.0, 0.0, 0.0),
-    ]
+    none = (0.0, 0.0, 0.0)
+    levels = [none, sidebar(30.0), sidebar(50.0), sidebar(10.0), none, direct(50.0)]
+    levels += [(30.0, 0.0, 0.0), (-20.0, -20.0, 15.0), (0.0, 20.0, 25.0), none]
     swept = chirp((4.0, 4.0, 3.0), 2.0, 30.0, 4.0, rate)
     return steps(levels, 2.0, rate).then(swept)
 

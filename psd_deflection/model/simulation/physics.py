@@ -100,14 +100,8 @@ class Physics:
     @property
     def statics(self) -> LinkStatics:
         """The link with these constants."""
-        return LinkStatics(
-            self.length,
-            self.bending_stiffness,
-            self.torsional_stiffness,
-            self.clamp_bending,
-            self.clamp_torsion,
-            self.xp,
-        )
+        stiffness, clamp = (self.bending_stiffness, self.torsional_stiffness), (self.clamp_bending, self.clamp_torsion)
+        return LinkStatics(self.length, *stiffness, *clamp, self.xp)
 
     @property
     def at_rest(self) -> tuple[float, float]:

@@ -65,11 +65,7 @@ class ForwardModel:
         bending = mode_coefficients(p.bending_frequency, p.bending_damping_ratio, p.period, phase)
         torsion = mode_coefficients(p.torsion_frequency, p.torsion_damping_ratio, p.period, phase)
         self._at_rest = p.at_rest
-        self._modes = (
-            Filter(bending, self._at_rest[0]),
-            Filter(bending, self._at_rest[1]),
-            Filter(torsion),
-        )
+        self._modes = (Filter(bending, self._at_rest[0]), Filter(bending, self._at_rest[1]), Filter(torsion))
         self._steady = steady
         self._states: list[State] = [{} for _ in self.effects]
         self._count = 0

@@ -5,12 +5,4 @@
 from psd_deflection.model.solvers.interface import Solution, Solutions, Solver, SolverStatus
 from psd_deflection.model.solvers.registry import SOLVERS, make_solver, solver_from_rig
 
-__all__ = [
-    'SOLVERS',
-    'Solution',
-    'Solutions',
-    'Solver',
-    'SolverStatus',
-    'make_solver',
-    'solver_from_rig',
-]
+__all__ = ['SOLVERS', 'Solution', 'Solutions', 'Solver', 'SolverStatus', 'make_solver', 'solver_from_rig']

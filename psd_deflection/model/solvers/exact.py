@@ -261,12 +261,7 @@ def _newton(
 
 
 def _newton_many(
-    theta: FloatArray,
-    difference: FloatArray,
-    mixed: FloatArray,
-    along: FloatArray,
-    across: FloatArray,
-    xp: Arithmetic,
+    theta: FloatArray, difference: FloatArray, mixed: FloatArray, along: FloatArray, across: FloatArray, xp: Arithmetic
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """:func:`_newton` for n blocks, until the slowest ends; also returns which converged."""
     converged = np.zeros(theta.shape, dtype=bool)

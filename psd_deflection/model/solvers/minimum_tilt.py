@@ -131,14 +131,7 @@ class MinimumTiltSolver(Solver):
         return self._length - long > _TOO_SHORT * sqrt(ax * ax * (vx1 + vx2) + ay * ay * (vy1 + vy2))
 
     def _covariance(
-        self,
-        ax: float,
-        ay: float,
-        reach: float,
-        off: float,
-        cos_beta: float,
-        long: float,
-        variances: tuple[float, ...],
+        self, ax: float, ay: float, reach: float, off: float, cos_beta: float, long: float, variances: tuple[float, ...]
     ) -> Covariance:
         """Sensitivities to noise along (e) and across (n) the base line, dot by dot; (ax, ay) is e."""
         lever = reach / long

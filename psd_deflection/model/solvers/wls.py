@@ -25,7 +25,6 @@ from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate.layout import Geometry, check_twist
 from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.model.plate.plate import Number
-from psd_deflection.model.solvers.fixed_gain import FixedGain
 from psd_deflection.model.solvers.interface import (
     Solution,
     Solutions,
@@ -34,6 +33,7 @@ from psd_deflection.model.solvers.interface import (
     flat_solutions,
     weighted_gain,
 )
+from psd_deflection.model.solvers.ols import FixedGain
 from psd_deflection.model.solvers.plane import checked_variances
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig

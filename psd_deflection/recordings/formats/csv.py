@@ -6,11 +6,7 @@ from pathlib import Path
 
 from psd_deflection.recordings.formats.format import Format, ReadOptions, Sink, WriteOptions
 from psd_deflection.recordings.read.csv_reader import CsvRecording
-from psd_deflection.recordings.write.csv_writer import (
-    CsvEstimateSink,
-    CsvReferenceFile,
-    CsvSampleSink,
-)
+from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvReferenceFile, CsvSampleSink
 from psd_deflection.rig.config import rig_from_values
 
 

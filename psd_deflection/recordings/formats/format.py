@@ -1,7 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
 """The declaration of a format, how one is read and written; all formats, ours and those of other packages (entry points
-of the group ``psd_deflection.formats``), and which of them a path means."""
+of the group ``psd_deflection.formats``), which of them a path means, and the file that it makes."""
 
 import importlib
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -10,7 +10,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol
 
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.plugins import loaded
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import Record, ReferenceWithCovariance
@@ -136,3 +136,36 @@ def format_of_content(path: Path) -> Format | None:
 def endings_of_recordings() -> tuple[str, ...]:
     """Endings of the files that can be read."""
     return tuple(suffix for f in formats() if f.read is not None for suffix in f.suffixes)
+
+
+def open_sink(
+    path: str | Path,
+    rig_values: Mapping[str, object],
+    *,
+    device_hello: Mapping[str, object] | None = None,
+    samples_with: Collection[type[Record]] | None = None,
+    title: str = '',
+    psds: int = 2,
+) -> Sink:
+    """The sink for ``path``: a ``.csv``, an ``.rrd`` (for Rerun), an ``.mcap`` (a single file), else a bag folder.
+
+    ``rig_values``: the flat parameter set. ``samples_with``: a CSV holds the samples, with columns for these
+    kinds of records; None: it holds the estimates. ``title``: title of an ``.rrd``. ``psds``: of the samples of a CSV.
+    Raises RecordingError if ``path`` exists or cannot be made, or if its format is only read; ConfigError if rerun
+    is not installed.
+    """
+    form = format_of_name(path)
+    if form.write is None:
+        raise RecordingError(f'{path}: {form.help} is read and not written')
+    options = WriteOptions(
+        rig_values=rig_values, device_hello=device_hello, samples_with=samples_with, title=title, psds=psds
+    )
+    return form.write(Path(path), options)
+
+
+def open_reference_file(path: str | Path) -> ReferenceFile:
+    """The file for the poses of a camera. Raises as :func:`open_sink` does."""
+    form = format_of_name(path)
+    if form.write_references is None:
+        raise RecordingError(f'{path}: {form.help} does not take the poses of a camera')
+    return form.write_references(Path(path))

@@ -218,11 +218,7 @@ class McapReader:
                 yield from self._messages_in(records, topics, wanted, allowance)
 
     def _messages_in(
-        self,
-        records: bytes,
-        topics: Collection[str] | None,
-        wanted: dict[int, RecordedChannel],
-        allowance: Allowance,
+        self, records: bytes, topics: Collection[str] | None, wanted: dict[int, RecordedChannel], allowance: Allowance
     ) -> Iterator[RawMessage]:
         # Without a Message for each: this loop handles every message of a replay.
         unpack, head = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size

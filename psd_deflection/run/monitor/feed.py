@@ -28,18 +28,7 @@ from psd_deflection.rig.declarations import ZEROS
 QUEUE_ITEMS = 2000
 """Ten seconds at 100 blocks/s and two items per block."""
 
-_LAG = (
-    'dx',
-    'dy',
-    'theta',
-    'sd_dx',
-    'sd_dy',
-    'sd_theta',
-    'present',
-    'lost',
-    'status',
-    'chi_square',
-)
+_LAG = ('dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'present', 'lost', 'status', 'chi_square')
 
 
 def row_columns(psds: int) -> tuple[str, ...]:

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from psd_deflection.base.errors import PsdDeflectionError
+from psd_deflection.measure.steps import REACH_S, RecentDots
 from psd_deflection.measure.watch import Alarm
-from psd_deflection.records import (
-    DiagnosticReport,
-)
+from psd_deflection.records import DiagnosticReport
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import HealthReporter
-from psd_deflection.run.last_load_change import REACH_S, RecentDots
 from psd_deflection.run.monitor.metrics import Family, of_session
 from psd_deflection.run.session import Session
 from psd_deflection.run.session_texts import load_text, mark_text, why_no_zero, zero_text

@@ -25,14 +25,7 @@ class Input:
 
 
 def _input(
-    name: str,
-    default: float,
-    unit: str,
-    what: str,
-    source: str,
-    maximum: float,
-    *,
-    above: float | None = None,
+    name: str, default: float, unit: str, what: str, source: str, maximum: float, *, above: float | None = None
 ) -> Input:
     minimum = None if above is not None else 0.0
     return Input(Parameter(name, 'double', default, unit, what, minimum=minimum, maximum=maximum, above=above), source)

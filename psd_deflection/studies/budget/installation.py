@@ -26,32 +26,25 @@ def _tolerance(name: str, count: int) -> Callable[[Situation], FloatArray]:
     return lambda at: np.full(count, at[name] / ROOT_3)
 
 
+def _tolerated(name: str, row: str, tolerance: str, count: int, field: str, words: str, unit: str = 'm') -> Term:
+    """A cause that a calibration takes away: ``count`` error parameters within the input ``tolerance``, which add to
+    the ``field`` of the chain."""
+    formula, sizes = f'{tolerance} / sqrt 3{words}', _tolerance(tolerance, count)
+    term = Term(name, row, Kind.SYSTEMATIC, formula, (tolerance,), sizes, adds_to(field), unit, Distribution.UNIFORM)
+    return replace(term, calibrated=True)
+
+
+_PARALLEL = 'the beam out of parallel, times the way of the plate along it'
+_BOTH = 'the same error in l and in q (3.19 corrected)'
+
 # ---- E_Algn: alignment ----
 
-SENSOR_ROTATION = Term(
-    'sensor_rotation',
-    'E_Algn',
-    Kind.SYSTEMATIC,
-    "rotation_tolerance / sqrt 3: the sensor's axes turned in the plate",
-    ('rotation_tolerance',),
-    _tolerance('rotation_tolerance', 2),
-    adds_to('rotation'),
-    unit='rad',
-    distribution=Distribution.UNIFORM,
-    calibrated=True,
+SENSOR_ROTATION = _tolerated(
+    'sensor_rotation', 'E_Algn', 'rotation_tolerance', 2, 'rotation', ": the sensor's axes turned in the plate", 'rad'
 )
 
-BEAM_MISALIGNMENT = Term(
-    'beam_misalignment',
-    'E_Algn',
-    Kind.SYSTEMATIC,
-    'beam_tolerance / sqrt 3: the beam out of parallel, times the way of the plate along it',
-    ('beam_tolerance',),
-    _tolerance('beam_tolerance', 4),
-    adds_to('beam_slope'),
-    unit='rad',
-    distribution=Distribution.UNIFORM,
-    calibrated=True,
+BEAM_MISALIGNMENT = _tolerated(
+    'beam_misalignment', 'E_Algn', 'beam_tolerance', 4, 'beam_slope', f': {_PARALLEL}', 'rad'
 )
 
 
@@ -93,45 +86,18 @@ SLOPE_RATIO = Term(
     calibrated=True,
 )
 
-SENSOR_TILT = Term(
-    'sensor_tilt',
-    'E_Tilt',
-    Kind.SYSTEMATIC,
-    "tilt_tolerance / sqrt 3: the sensor's surface tilted on the plate",
-    ('tilt_tolerance',),
-    _tolerance('tilt_tolerance', 4),
-    adds_to('tilt'),
-    unit='rad',
-    distribution=Distribution.UNIFORM,
-    calibrated=True,
+SENSOR_TILT = _tolerated(
+    'sensor_tilt', 'E_Tilt', 'tilt_tolerance', 4, 'tilt', ": the sensor's surface tilted on the plate", 'rad'
 )
 
 
 # ---- PageSection 3.2: where the centres are ----
 
-CENTER_POSITION = Term(
-    'center_position',
-    'e_Xo, e_Yo',
-    Kind.SYSTEMATIC,
-    'center_tolerance / sqrt 3 in x and y; the same error in l and in q (3.19 corrected)',
-    ('center_tolerance',),
-    _tolerance('center_tolerance', 4),
-    adds_to('center_error'),
-    distribution=Distribution.UNIFORM,
-    calibrated=True,
+CENTER_POSITION = _tolerated(
+    'center_position', 'e_Xo, e_Yo', 'center_tolerance', 4, 'center_error', f' in x and y; {_BOTH}'
 )
 
-SENSOR_HEIGHT = Term(
-    'sensor_height',
-    '',
-    Kind.SYSTEMATIC,
-    'height_tolerance / sqrt 3, times the tilt of the plate',
-    ('height_tolerance',),
-    _tolerance('height_tolerance', 2),
-    adds_to('height_error'),
-    distribution=Distribution.UNIFORM,
-    calibrated=True,
-)
+SENSOR_HEIGHT = _tolerated('sensor_height', '', 'height_tolerance', 2, 'height_error', ', times the tilt of the plate')
 
 
 def _expand(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
@@ -149,16 +115,8 @@ BRACKET_EXPANSION = Term(
     unit='',
 )
 
-INSTALLATION = (
-    SENSOR_ROTATION,
-    BEAM_MISALIGNMENT,
-    PLANE_TILT,
-    SLOPE_RATIO,
-    SENSOR_TILT,
-    CENTER_POSITION,
-    SENSOR_HEIGHT,
-    BRACKET_EXPANSION,
-)
+OF_ANGLES = (SENSOR_ROTATION, BEAM_MISALIGNMENT, PLANE_TILT, SLOPE_RATIO, SENSOR_TILT)
+INSTALLATION = (*OF_ANGLES, CENTER_POSITION, SENSOR_HEIGHT, BRACKET_EXPANSION)
 
 
 # ---- E_RF: refraction ----
@@ -225,17 +183,13 @@ INTERFERENCE = Term(
 # ---- The beams ----
 
 
-def _pointing(at: Situation) -> FloatArray:
-    return np.full(4, at['pointing_drift'] * at.rig.link.length)
-
-
 POINTING = Term(
     'pointing_drift',
     '',
     Kind.SYSTEMATIC,
     'pointing_drift x L, each beam and axis by itself',
     ('pointing_drift',),
-    _pointing,
+    lambda at: np.full(4, at['pointing_drift'] * at.rig.link.length),
     adds_to('beam_shift'),
 )
 

@@ -254,31 +254,18 @@ ZEROING = Term(
 )
 
 
-def _sensor_gain(at: Situation) -> FloatArray:
-    return np.full(4, at['gain_tolerance'] / ROOT_3)
-
-
 SENSOR_GAIN = Term(
     'sensor_gain',
     '',
     Kind.SYSTEMATIC,
     'x -> x (1 + g), g = gain_tolerance / sqrt 3, each channel by itself',
     ('gain_tolerance',),
-    _sensor_gain,
+    lambda at: np.full(4, at['gain_tolerance'] / ROOT_3),
     adds_to('gain'),
     unit='',
     distribution=Distribution.UNIFORM,
     calibrated=True,
 )
 
-TERMS = (
-    LIGHT_PROFILE,
-    SPOT_CLIPPING,
-    DARK_CURRENT,
-    RESISTIVITY,
-    THERMAL_DRIFT,
-    SENSOR_GAIN,
-    AMPLIFIER_NOISE,
-    QUANTISATION,
-    ZEROING,
-)
+OF_THE_SPOT = (LIGHT_PROFILE, SPOT_CLIPPING, DARK_CURRENT, RESISTIVITY, THERMAL_DRIFT)
+TERMS = (*OF_THE_SPOT, SENSOR_GAIN, AMPLIFIER_NOISE, QUANTISATION, ZEROING)

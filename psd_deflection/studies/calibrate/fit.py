@@ -189,13 +189,7 @@ def weight_matrices(linear: Linear, rows: Rows, noise: Noise) -> FloatArray:
 
 
 def fit(
-    rows: Rows,
-    rig: Rig,
-    prior: Prior,
-    kind: Kind = 'reference',
-    *,
-    free: Mask,
-    start: CalibrationFit | None = None,
+    rows: Rows, rig: Rig, prior: Prior, kind: Kind = 'reference', *, free: Mask, start: CalibrationFit | None = None
 ) -> CalibrationFit:
     """Fit ``rows``. ``start``: an earlier fit of the same rows, to begin from.
 
@@ -281,13 +275,7 @@ def residual_at(full_fit: CalibrationFit, z: FloatArray) -> FloatArray:
 
 
 def _step(
-    linear: Linear,
-    inverse: FloatArray,
-    robust: FloatArray,
-    z: FloatArray,
-    prior: Prior,
-    free: Mask,
-    rows: Rows,
+    linear: Linear, inverse: FloatArray, robust: FloatArray, z: FloatArray, prior: Prior, free: Mask, rows: Rows
 ) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton's step (SIZE,) and the information (SIZE, SIZE) of the rows."""
     right, information = _normal(linear, inverse * robust[:, None, None], rows)
@@ -393,13 +381,7 @@ def posterior(information: FloatArray, prior: Prior, free: Mask) -> FloatArray:
 
 
 def variance_components(
-    linear: Linear,
-    rows: Rows,
-    robust: FloatArray,
-    kind: Kind,
-    number: int,
-    information: FloatArray,
-    prior: Prior,
+    linear: Linear, rows: Rows, robust: FloatArray, kind: Kind, number: int, information: FloatArray, prior: Prior
 ) -> Noise:
     """Return the variance components from the residuals."""
     good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)

@@ -21,14 +21,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.shared_findings import noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
-from psd_deflection.studies.discover.applied import (
-    directions,
-    levels,
-    ringing_on,
-    times,
-    unseen,
-    wrong_load_findings,
-)
+from psd_deflection.studies.discover.applied import directions, levels, ringing_on, times, unseen, wrong_load_findings
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, LoadDirection
 from psd_deflection.studies.discover.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.problem import Problem, Progress
@@ -394,11 +387,7 @@ def set_up(problem: Problem) -> Problem:
             steps[2::3] = 0.0
         setup += step_findings(ws.observations[0].rig, steps, finer=finer)[0]
     return replace(
-        problem,
-        named=tuple(named),
-        setup=tuple(setup),
-        values=values,
-        stated_gap=machine.recorded.stated_gap,
+        problem, named=tuple(named), setup=tuple(setup), values=values, stated_gap=machine.recorded.stated_gap
     )
 
 

@@ -176,10 +176,7 @@ def mistakes(
 
 
 BEGINNING = 'beginning'
-RIG_NUMBERS = {
-    'bending_frequency': 'dynamics.bending_frequency',
-    'torsion_frequency': 'dynamics.torsion_frequency',
-}
+RIG_NUMBERS = {'bending_frequency': 'dynamics.bending_frequency', 'torsion_frequency': 'dynamics.torsion_frequency'}
 """Mistakes that are reported as effects, as the schema of result.json knows no name for them: keys of the rig file."""
 FIRST = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay', *RIG_NUMBERS))
 """Those that touch every channel: beside an effect a small one would stand in for what no effect explains, so they are

@@ -105,14 +105,7 @@ class Problem:
         null = refit(search.workspace, ())
         result = SearchResult(null, null)
         return cls(
-            machine=machine,
-            search=search,
-            result=result,
-            fit=null,
-            null=null,
-            rng=rng,
-            seed=seed,
-            progress=progress,
+            machine=machine, search=search, result=result, fit=null, null=null, rng=rng, seed=seed, progress=progress
         )
 
     @property

@@ -10,14 +10,7 @@ import numpy as np
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.log import Note
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.read.references import (
-    IN_MILLIMETRES,
-    KNOWN,
-    TIMES,
-    ReadingsTable,
-    is_table,
-    kinds_of,
-)
+from psd_deflection.recordings.read.references import IN_MILLIMETRES, KNOWN, TIMES, ReadingsTable, is_table, kinds_of
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import rig_at_end, warnings_about_rig
 from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN, digest_of

@@ -71,10 +71,7 @@ def _against_chart(discovery: Conclusion) -> Chart | None:
     for name, values in ws.against().items():
         at = np.concatenate(values)
         if np.any(np.isfinite(at)) and np.nanmax(at) > np.nanmin(at):
-            curves = (
-                Series('before', at, before, BEFORE, 'points'),
-                Series('after', at, after, AFTER, 'points'),
-            )
+            curves = (Series('before', at, before, BEFORE, 'points'), Series('after', at, after, AFTER, 'points'))
             panels.append(Panel(curves, name, _labels(ws)[row], height=SMALL))
     words = f'measured minus simulated {ws.channels[row]} against loads and position'
     return Chart(words, panels, beside=min(3, len(panels))) if panels else None
@@ -215,10 +212,7 @@ def _law_chart(discovery: RigConclusion, found_law: FoundLaw) -> Chart:
     scale, unit = (1e3, f'm{VARIABLES[name]}') if VARIABLES[name] in ('m', 'rad') else (1.0, VARIABLES[name])
     at = np.concatenate(known_values(ws, found_law.beside, name)) * scale
     before, after = (np.concatenate([b[row] for b in blocks]) * 1e6 for blocks in (missing, residual))
-    law = (
-        Series('missing', at, before, BEFORE, 'points'),
-        Series('law', at, moved[row] * 1e6, 'text', 'points'),
-    )
+    law = (Series('missing', at, before, BEFORE, 'points'), Series('law', at, moved[row] * 1e6, 'text', 'points'))
     along, label = f'{name} / {unit}', f'{ws.channels[row]} / µm'
     panels = [
         Panel(law, along, label, height=SMALL),

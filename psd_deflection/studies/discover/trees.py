@@ -57,11 +57,7 @@ def effect_tree(e: NamedEffect) -> dict[str, Any]:
         },
         'suggested_experiment': None if e.suggestion is None else e.suggestion.text,
         'rivals': [
-            {
-                'name': r.active.effect.name,
-                'parameters': parameters_of(r),
-                'delta_bic': number(r.delta_bic),
-            }
+            {'name': r.active.effect.name, 'parameters': parameters_of(r), 'delta_bic': number(r.delta_bic)}
             for r in e.fitted_alternatives
         ],
     }

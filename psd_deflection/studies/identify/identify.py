@@ -3,7 +3,7 @@
 """Finds the modes of the link in a recording; the answer, its page and its rig file (docs/identification.md)."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,14 +15,48 @@ from psd_deflection import __version__
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, text_column
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.link.shapers import Shaper, recommended
 from psd_deflection.model.simulation.catalogue import effects_of_rig
-from psd_deflection.records import FloatArray
+from psd_deflection.model.solvers.registry import solver_from_rig
+from psd_deflection.recordings.charts import moments
+from psd_deflection.recordings.read.references import read_run
+from psd_deflection.records import FloatArray, Moment, SampleBlock
 from psd_deflection.rig.parameter_files import with_values
-from psd_deflection.studies.identify.from_recordings import IdentifyProblem
 from psd_deflection.studies.identify.modes import modes_of
 from psd_deflection.studies.identify.spectra import AxisModes, Mode
-from psd_deflection.studies.study import PageSection, StudyResult, described, edited_rig_file, named
+from psd_deflection.studies.study import Opened, PageSection, StudyResult, described, edited_rig_file, named
+
+Counted = Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]
+"""Hands blocks on and counts them, for a progress bar."""
+
+
+@dataclass(frozen=True)
+class IdentifyProblem:
+    """``poses`` (n, 3): dX m, dY m, theta rad of single samples on an even grid, NaN if lost; ``rate``, Hz.
+
+    ``marks``: of the recording, from the first of them.
+    """
+
+    opened: Opened
+    poses: FloatArray
+    rate: float
+    marks: tuple[Moment, ...] = ()
+
+
+def read_identify(opened: Opened, with_progress: Counted = iter) -> IdentifyProblem:
+    """Solve every trusted sample. Raises RecordingError if there are none."""
+    recording, rig = opened.recording, opened.rig
+    run = read_run(recording, Pipeline(rig), with_progress(recording.blocks()))
+    rate = rig.converter.sample_rate_hz
+    solved = solver_from_rig(rig.estimator.solver, rig).solve_many(run.dots, dot_noise_variances(rig))
+    place = np.rint((run.t_ns - run.t_ns[0]) * 1e-9 * rate).astype(np.int64)
+    poses = np.full((int(place[-1]) + 1, 3), np.nan)
+    good = solved.status == 0
+    poses[place[good]] = solved.pose[good]
+    return IdentifyProblem(opened, poses, rate, moments(recording.marks(), int(run.t_ns[0])))
+
 
 KINDS = {'bending': (0, 1), 'torsion': (2,)}
 """Modes of the rig file, and the axes that show them."""
@@ -47,7 +81,7 @@ class Identified(StudyResult):
 
     @property
     def poses(self) -> FloatArray:
-        """See :class:`~psd_deflection.studies.identify.from_recordings.IdentifyProblem`."""
+        """See :class:`IdentifyProblem`."""
         return self.problem.poses
 
     @property
@@ -168,10 +202,7 @@ class Identified(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """Modes and shapers of each axis, and parameters, SI units."""
-        return {
-            'axes': {name: self._axis_tree(i) for i, name in enumerate(AXES)},
-            'parameters': self.values,
-        }
+        return {'axes': {name: self._axis_tree(i) for i, name in enumerate(AXES)}, 'parameters': self.values}
 
     def _axis_tree(self, i: int) -> dict[str, Any]:
         axis, best = self.axes[i], self.shaper_of(i)

@@ -194,12 +194,7 @@ def mode_in_operation(samples: FloatArray, rate: float, frequency: float) -> Mod
     for zeta in (0.005, 0.02, 0.08):
         sizes = [top * 4.0 * zeta**2 * frequency**4 * 0.3, frequency, zeta, float(np.median(p)) * 0.1 + 1e-30]
         start = np.array([*np.log(sizes), 0.0])
-        tried = minimize(
-            loss,
-            start,
-            method='Nelder-Mead',
-            options={'maxfev': 6000, 'xatol': 1e-6, 'fatol': 1e-6},
-        )
+        tried = minimize(loss, start, method='Nelder-Mead', options={'maxfev': 6000, 'xatol': 1e-6, 'fatol': 1e-6})
         if best is None or tried.fun < best.fun:
             best = tried
     if best is None or not scatters_as_exponential(p / density(best.x)):

@@ -84,10 +84,7 @@ class SwayingLoad:
 
 
 def swaying(
-    implied: ImpliedLoads,
-    annotated: Sequence[Hold],
-    again: Callable[[Sequence[Hold]], ImpliedLoads],
-    period: float,
+    implied: ImpliedLoads, annotated: Sequence[Hold], again: Callable[[Sequence[Hold]], ImpliedLoads], period: float
 ) -> list[SwayingLoad]:
     """Return the holds of ``implied`` in which the link swings. ``annotated``: between annotated changes; ``again``:
     the loads that other holds ask for; ``period``: s from one sample to the next.

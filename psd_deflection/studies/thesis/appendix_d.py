@@ -10,8 +10,8 @@ import numpy as np
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate.layout import Geometry, check_twist
 from psd_deflection.model.plate.plate import flat_points, plate_points
-from psd_deflection.model.solvers.fixed_gain import FixedGain
 from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
+from psd_deflection.model.solvers.ols import FixedGain
 from psd_deflection.model.solvers.wls import THESIS_ROW_SCALING
 from psd_deflection.records import FloatArray
 
@@ -115,9 +115,7 @@ class AppendixDResult(NamedTuple):
 
 
 def appendix_d_iterative(
-    dots_mm: tuple[float, ...],
-    init_mm: tuple[float, ...],
-    centers_mm: tuple[float, ...] = (0.0, 70.0, -100.0, 0.0),
+    dots_mm: tuple[float, ...], init_mm: tuple[float, ...], centers_mm: tuple[float, ...] = (0.0, 70.0, -100.0, 0.0)
 ) -> AppendixDResult:
     """Return the code of Appendix D: dots x1, y1, x2, y2 and their pre-load values, mm.
 

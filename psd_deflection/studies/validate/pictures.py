@@ -82,9 +82,6 @@ def _scatter(drawn: DrawnAgreement) -> Chart:
         estimate, reference = SHOWN[i] * drawn.estimate[:, i], SHOWN[i] * drawn.reference[:, i]
         both = np.concatenate([reference, estimate])
         ends = np.array([np.nanmin(both), np.nanmax(both)])
-        curves = (
-            Series('equal', ends, ends, 'quiet'),
-            Series('', reference, estimate, 'blue', 'points'),
-        )
+        curves = (Series('equal', ends, ends, 'quiet'), Series('', reference, estimate, 'blue', 'points'))
         panels.append(Panel(curves, f'{symbol}: reference / {unit}', f'{symbol}: estimate / {unit}', height=SMALL))
     return Chart('estimate over reference', panels, beside=3)

@@ -13,7 +13,6 @@ from psd_deflection.base.errors import ConfigError
 
 URDF = Path(__file__).parents[3] / 'config' / 'two_links.urdf'
 EXAMPLE = Path(__file__).parents[3] / 'config' / 'two_links.yaml'
-
 WRIST = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
 <joint name="slide" type="prismatic"><parent link="a"/><child link="b"/><origin xyz="1 2 3" rpy="0.1 -0.4 0.9"/>
 <axis xyz="0 3 4"/><limit lower="-0.1" upper="0.2"/></joint>

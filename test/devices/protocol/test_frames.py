@@ -39,9 +39,7 @@ from psd_deflection.records import MOST_PSDS
 
 SAMPLE = SampleFrame(0, 1, 1000, (1, -1, 16384, 0, 0, 16384))
 SAMPLE_BYTES = bytes.fromhex('020102010101 03e803 01010101 01 0201 03ffff 0240 01010101 0640713ed6b200')
-
 WIDE = 'a wide sample'
-
 GOOD: list[tuple[str, str, GoodFrame]] = [
     ('a sample', SAMPLE_BYTES.hex(), SAMPLE),
     (

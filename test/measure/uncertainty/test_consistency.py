@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from psd_deflection.measure.uncertainty import consistency
 from psd_deflection.measure.uncertainty.combinations import combinations_of
-from psd_deflection.measure.uncertainty.outliers import OutlierSearch
+from psd_deflection.measure.uncertainty.consistency import OutlierSearch
 from psd_deflection.records import FloatArray
 
 

@@ -144,7 +144,6 @@ def test_stated_deviations_and_correlations_are_taken() -> None:
 
 
 RIG = load_rig()
-
 OWN = """
 from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter
 

@@ -58,8 +58,6 @@ EVERY = [
     for name, effect in catalogue().items()
     for choice in effect.variants()
 ]
-
-
 STRONG = [
     pytest.param(
         typical(effect, choice, 100.0),
@@ -300,7 +298,6 @@ def test_moved_optics_of_base_psds_are_rejected() -> None:
 
 STEPS = loads.steps([(0, 0, 0), (5, -50, -29), (30, 10, 12), (20, -25, 10), (-15, -25, 10)], 0.5).loads
 WARMING = 20.0 + 5.0 * np.linspace(0, 1, len(STEPS)) ** 2
-
 AMPLITUDES = {
     'ambient_light': {'level': 0.3, 'x': 2e-3, 'y': -1e-3},
     'amplifier_saturation': {'limit': 2.0},
@@ -311,7 +308,6 @@ AMPLITUDES = {
     'second_bending_mode': {'gain': 0.05, 'frequency': 71.0, 'damping_ratio': 0.015},
 }
 """Values that show each parameter, if ten probes do not."""
-
 LARGEST_MISS = {
     # What a load step does between two samples is interpolated in another way there.
     'amplifier_lag': 2e-2,

@@ -15,7 +15,6 @@ PARALLEL_BEAMS = CASES[:11]
 EQUAL = (4e-12,) * 4
 SIDEBAR = (0.03, 0.5, 10.0, 0.1)
 DIRECT = (3.0, 0.5, 10.0, 0.1)
-
 METHODS: list[tuple[str, dict[str, Any], str]] = [
     ('exact', {}, 'procrustes'),
     ('exact', {}, 'planar_gn_k0'),
@@ -31,7 +30,6 @@ METHODS: list[tuple[str, dict[str, Any], str]] = [
     ('iterative_printed', {'criterion': 'absolute'}, 'iter_22_abs'),
     ('iterative_printed', {'criterion': 'argmin'}, 'iter_22_argmin'),
 ]
-
 # The source's own code counts its angle clockwise.
 RAW_METHODS: list[tuple[str, dict[str, Any], str]] = [
     ('appendix_d_ols', {}, 'ols_code_raw'),

@@ -24,7 +24,6 @@ VARIANCES = {
 THRESHOLD = ('iterative_printed', 'appendix_d')
 ELSEWHERE = ('pose', 'base_pair')
 """They reject the thesis rig: three staggered PSDs, and PSDs at the base, are what they are for."""
-
 SMOOTH: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in SOLVERS if name not in THRESHOLD + ELSEWHERE),
     ('wls', {'weights': 'thesis'}),

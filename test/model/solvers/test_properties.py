@@ -16,7 +16,6 @@ from psd_deflection.model.solvers import SolverStatus, make_solver
 L = 0.585
 ISOTROPIC = (4e-12, 4e-12, 1e-12, 1e-12)
 UNEQUAL = (4e-12, 1e-12, 9e-12, 2e-12)
-
 many = settings(deadline=None, max_examples=60)
 
 

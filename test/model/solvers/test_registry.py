@@ -18,7 +18,6 @@ from psd_deflection.run.session import Session
 from psd_deflection.studies.budget.chain import METHODS
 
 BAG = Path(__file__).parents[3] / 'bags' / 'clean'
-
 MADE_UP = """
 from psd_deflection.base.errors import SolverError
 from psd_deflection.model.solvers.exact import ExactSolver

@@ -17,7 +17,6 @@ from psd_deflection.rig.config import rig_from_values
 from test.model.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
 
 Array = np.ndarray[Any, Any]
-
 SKEW = Geometry(np.array([[0.06, 0.05], [-0.05, -0.03]]), np.array([[3e-4, -2e-4], [1e-4, 5e-4]]), np.zeros(2), 0.585)
 AT_THE_BASE = Geometry(
     np.array([[0.01, 0.07], [-0.1, 0.02]]), np.array([[3e-4, -2e-4], [1e-4, 5e-4]]), np.array([-0.585, -0.485]), 0.585

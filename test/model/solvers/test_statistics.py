@@ -16,7 +16,6 @@ FEWER = 4_000
 """Of the methods that solve block by block."""
 READING_VARIANCES = np.array([4e-12, 1e-12, 9e-12, 2e-12, 3e-12, 6e-12])
 POSE = (1.5e-3, -2.5e-3, np.radians(-1.2))
-
 STAGGERED = Geometry(
     np.array([[0.1, 0.0], [-0.05, 0.087], [-0.05, -0.087]]), np.zeros((3, 2)), np.array([0.1, -0.05, -0.05]), 0.585
 )

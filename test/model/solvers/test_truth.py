@@ -18,7 +18,6 @@ from psd_deflection.model.solvers.subset import OnePsd
 from psd_deflection.rig.config import load_rig
 
 Array = np.ndarray[Any, Any]
-
 TWO = Geometry(np.array([[0.0, 0.07], [-0.1, 0.01]]), np.array([[3e-4, -2e-4], [1e-4, 5e-4]]), np.zeros(2), 0.585)
 THREE = Geometry(
     np.array([[0.1, 0.0], [-0.05, 0.087], [-0.04, -0.087]]), np.full((3, 2), 2e-4), np.array([0.1, -0.05, -0.04]), 0.585

@@ -12,8 +12,8 @@ import psd_deflection as pd
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.recordings.formats import format
+from psd_deflection.recordings.formats.format import open_reference_file, open_sink
 from psd_deflection.recordings.read.references import read_references
-from psd_deflection.recordings.write.sinks import open_reference_file, open_sink
 from psd_deflection.records import ReferenceWithCovariance, SampleBlock
 from psd_deflection.rig.config import load_rig
 from test.plug_in import install_plug_in

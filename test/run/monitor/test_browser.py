@@ -28,9 +28,7 @@ from .browsing import Page
 from .serving import BLOCK_NS, START_NS, Serving
 
 pytestmark = pytest.mark.browser
-
 Start = Callable[..., Program]
-
 BAGS = Path(__file__).parents[3] / 'bags'
 
 
@@ -96,8 +94,6 @@ HEIGHTS = """(() => {
   return [sums[0] / counts[0], sums[1] / counts[1]];
 })()"""
 """Mean rows of the pixels in the colours of dX and of dY; downwards."""
-
-
 STICKING_OUT = """(() => {
   for (const name of ['dx', 'dy', 'theta']) document.getElementById(name).textContent = '\u221212345.67';
   return [...document.querySelectorAll('main > section, .number, .number > *, figure, header > *')];

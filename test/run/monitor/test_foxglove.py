@@ -33,10 +33,8 @@ from test.heard import until
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
 BAGS = Path(__file__).parents[3] / 'bags'
-
 BUSY_S = 1.0
 """A busy machine may take longer."""
-
 Messages = dict[str, list[tuple[int, bytes]]]
 
 

@@ -16,7 +16,6 @@ from .browsing import Page
 from .serving import BLOCK_NS, START_NS, Serving
 
 pytestmark = pytest.mark.browser
-
 SLOWLY = 50
 """Blocks come once a second, so that an hour has few."""
 SECOND_NS = SLOWLY * BLOCK_NS
@@ -25,7 +24,6 @@ WARM_ANSWERS, MORE_ANSWERS = 400, 400
 CELL = 'document.getElementById("cell").textContent'
 OPEN = 'document.body.dataset.cells'
 PRESSED = '[...document.querySelectorAll(".windows [aria-pressed=true]")].map((b) => b.textContent).join()'
-
 OBSERVED = """((plot, from, to, is) => {
   const canvas = document.querySelector(plot + ' canvas');
   const over = document.querySelector(plot + ' .u-over').getBoundingClientRect();

@@ -39,7 +39,6 @@ from test.heard import WAIT_S
 from .serving import BLOCK_NS, START_NS, Serving, StillShown, estimate_of, spots_of
 
 Serve = Callable[..., Serving]
-
 KEEPS = optional('psd_deflection.run.monitor.kept_history')
 
 

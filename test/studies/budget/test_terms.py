@@ -67,8 +67,6 @@ def test_an_input_that_is_named_has_an_effect(cause: Cause) -> None:
 DRAWS = 10_000
 # Four standard errors of a deviation from that many normal draws, and 1 % for what is beyond second order.
 TOLERANCE = 4.0 / math.sqrt(2.0 * DRAWS) + 0.01
-
-
 # A femtometre is rounding: E_C of an exact method, and the tilt where it is in the model.
 FLOOR = np.array([1e-15, 1e-15, 1e-14])
 

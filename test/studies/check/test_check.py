@@ -29,16 +29,12 @@ from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Check
 
 CLOUD = 2e-3 * 0.5e-3
 """Noise of one sample, m."""
-
 FORCE = CLOUD / (0.585**3 / (3.0 * generator.EI))
 """N that move a dot by the noise of a sample."""
-
 TORQUE = CLOUD / (0.070 * 0.585 / generator.GJ)
 """N m that turn the nearer dot by the noise of a sample."""
-
 BLOCK = 1.0 / math.sqrt(20.0)
 """Noise of a block's mean over that of a sample."""
-
 Turn = Mapping[str, tuple[str, int]]
 """Of each channel of the device, the channel of the nominal rig whose signal it carries, and its sign."""
 
@@ -325,8 +321,6 @@ def test_removed_weight_moves_dots_by_what_it_held(tmp_path: Path, capsys: pytes
 
 
 RIG = load_rig()
-
-
 NAN = math.nan
 
 

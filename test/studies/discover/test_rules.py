@@ -43,7 +43,6 @@ RIG = load_rig()
 SIGMA = 1e-3
 FINE, CASES = 400, 8
 N = 6 * FINE
-
 Pictures = Mapping[tuple[str, str], FloatArray]
 
 

@@ -11,8 +11,7 @@ import pytest
 from blind.modes import RATE
 from psd_deflection.cli.main import main
 from psd_deflection.model.link.shapers import recommended, shaper
-from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.identify import Identified
+from psd_deflection.studies.identify.identify import Identified, IdentifyProblem
 from psd_deflection.studies.identify.spectra import AxisModes, Mode
 from psd_deflection.studies.study import Opened, opened
 

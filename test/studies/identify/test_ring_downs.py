@@ -14,9 +14,9 @@ from scipy.signal import lsim, periodogram
 from blind.generator import coloured
 from blind.modes import CASES, RATE, Link, driven, rung, scored
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.identify import from_recordings
+from psd_deflection.studies.identify import identify as module
 from psd_deflection.studies.identify import modes as fitting
-from psd_deflection.studies.identify.from_recordings import read_identify
+from psd_deflection.studies.identify.identify import read_identify
 
 SAMPLE_RATE = 1024.0
 """A power of two: times of samples have no error."""
@@ -501,10 +501,10 @@ def test_each_sample_has_its_place_on_an_even_grid(monkeypatch: pytest.MonkeyPat
         assert variances == 'variances'
         return SimpleNamespace(pose=pose, status=status)
 
-    monkeypatch.setattr(from_recordings, 'read_run', lambda *a: SimpleNamespace(t_ns=t_ns, dots=dots))
-    monkeypatch.setattr(from_recordings, 'Pipeline', lambda rig: None)
-    monkeypatch.setattr(from_recordings, 'dot_noise_variances', lambda rig: 'variances')
-    monkeypatch.setattr(from_recordings, 'solver_from_rig', lambda *a: SimpleNamespace(solve_many=solve_many))
+    monkeypatch.setattr(module, 'read_run', lambda *a: SimpleNamespace(t_ns=t_ns, dots=dots))
+    monkeypatch.setattr(module, 'Pipeline', lambda rig: None)
+    monkeypatch.setattr(module, 'dot_noise_variances', lambda rig: 'variances')
+    monkeypatch.setattr(module, 'solver_from_rig', lambda *a: SimpleNamespace(solve_many=solve_many))
     marks = [SimpleNamespace(t_ns=start + 1_500_000_000, text='knock')]
     recording = SimpleNamespace(blocks=list, marks=lambda: marks)
     rig: Any = SimpleNamespace(

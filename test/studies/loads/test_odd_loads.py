@@ -149,8 +149,6 @@ MANY_LEVELS = np.array(
 SHORT_DWELL = 2000
 SHORT_HELD = np.repeat(MANY_LEVELS, SHORT_DWELL, axis=0)
 WORDS = 'nobody noted it: note each change; this time is left out'
-
-
 STOPPED = SHORT_HELD.copy()
 STOPPED[4 * SHORT_DWELL :] = 0.0
 """Somebody noted nothing any more after the second load was taken off."""

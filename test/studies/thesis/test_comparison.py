@@ -21,7 +21,6 @@ from psd_deflection.studies.thesis import comparison
 from psd_deflection.studies.thesis.appendix_d import compared, mismatch, tilt_branches
 
 Cell = tuple[float, float, float]
-
 # rms of dX um, dY um, theta mdeg for flat poses, independent tilts, cantilever tilts.
 AUDIT: dict[str, tuple[Cell, Cell, Cell]] = {
     'section 2.2 as printed': ((73.01, 3.474, 59.71), (81.36, 9.492, 66.27), (76.67, 5.028, 62.69)),
@@ -115,7 +114,6 @@ CONSTANTS: dict[str, Any] = json.loads(
     (Path(__file__).parents[2] / 'data' / 'golden.json').read_text(encoding='utf-8')
 )['constants']
 CASES = scaling.table_b1_cases()
-
 FITTED_YOUNGS_MODULUS = 68.9e9
 """Pa: the value that Table B1's bending deflections of cases 1 and 5 were computed with (an erratum)."""
 

@@ -23,11 +23,10 @@ from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import FloatArray, Mark, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.study import Opened
-from psd_deflection.studies.validate import from_recordings as module
+from psd_deflection.studies.validate import validate as module
 from psd_deflection.studies.validate.agreement import Agreement, agreement
 from psd_deflection.studies.validate.clock import Motion, Offset
-from psd_deflection.studies.validate.from_recordings import ValidateProblem, read_validate
-from psd_deflection.studies.validate.validate import Validated, validate
+from psd_deflection.studies.validate.validate import Validated, ValidateProblem, read_validate, validate
 
 LATE = 0.0123
 """s, by which the stamps of the reference are early."""

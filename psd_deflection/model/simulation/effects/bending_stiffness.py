@@ -19,10 +19,7 @@ EFFECT = Effect(
     equation='EI -> EI (1 + scale)',
     source='beam theory (thesis appendix A)',
     needs='a known force',
-    parameters=(
-        EffectParameter('scale', '', -0.9, 10.0, 1e-3, 'relative change of EI'),
-        MOVES_FREQUENCY,
-    ),
+    parameters=(EffectParameter('scale', '', -0.9, 10.0, 1e-3, 'relative change of EI'), MOVES_FREQUENCY),
     order=0,
     point='configure',
     configure=_configure,

@@ -57,10 +57,7 @@ EFFECT = Effect(
     equation='v_i(t) -> v_i(t - delay)',
     source='two clocks; multiplexed converters',
     needs='fast motion (steps, sweeps)',
-    parameters=(
-        PSD,
-        EffectParameter('delay', 's', -4.0, 4.0, 1e-5, 'how late; below 0 how early', within=_searched),
-    ),
+    parameters=(PSD, EffectParameter('delay', 's', -4.0, 4.0, 1e-5, 'how late; below 0 how early', within=_searched)),
     point='volts',
     apply=_apply,
     ahead=_ahead,

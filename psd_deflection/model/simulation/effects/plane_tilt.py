@@ -19,14 +19,7 @@ EFFECT = Effect(
     needs='large deflection; an even effect',
     parameters=(
         EffectParameter(
-            'slope_ratio',
-            '',
-            0.0,
-            20.0,
-            1.5,
-            'k of φ = -k ΔY/L: 3/2 for a force, 2 for a moment',
-            grid=(1.5,),
-            power=2,
+            'slope_ratio', '', 0.0, 20.0, 1.5, 'k of φ = -k ΔY/L: 3/2 for a force, 2 for a moment', grid=(1.5,), power=2
         ),
     ),
     point='configure',

@@ -26,10 +26,7 @@ EFFECT = Effect(
     equation='x -> x (1 + k r^2), y likewise',
     source='Hamamatsu S1880 datasheet: position detection error; thesis E_R',
     needs='dots far from the centre',
-    parameters=(
-        PSD,
-        EffectParameter('k', '1/m^2', -1e4, 1e5, 100.0, 'cubic coefficient'),
-    ),
+    parameters=(PSD, EffectParameter('k', '1/m^2', -1e4, 1e5, 100.0, 'cubic coefficient')),
     point='dots',
     apply=_apply,
     correct=_correct,

@@ -29,10 +29,7 @@ EFFECT = Effect(
     equation='m = Rz(-angle) m_true',
     source='thesis chapter 3: E_Algn',
     needs='dots that move',
-    parameters=(
-        PSD,
-        EffectParameter('angle', 'rad', -3.2, 3.2, 1e-3, 'turn of the axes about +Z'),
-    ),
+    parameters=(PSD, EffectParameter('angle', 'rad', -3.2, 3.2, 1e-3, 'turn of the axes about +Z')),
     point='dots',
     apply=_apply,
     correct=_correct,

@@ -19,10 +19,7 @@ EFFECT = Effect(
     equation='GJ -> GJ (1 + scale)',
     source='torsion of a tube (thesis A-17, corrected)',
     needs='a known torque',
-    parameters=(
-        EffectParameter('scale', '', -0.9, 10.0, 1e-3, 'relative change of GJ'),
-        MOVES_FREQUENCY,
-    ),
+    parameters=(EffectParameter('scale', '', -0.9, 10.0, 1e-3, 'relative change of GJ'), MOVES_FREQUENCY),
     order=0,
     point='configure',
     configure=_configure,

@@ -16,16 +16,7 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.observation import Observation, load_cases
 from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
-from psd_deflection.studies.discover.hidden import (
-    FIRST,
-    SETUP,
-    Direction,
-    Free,
-    LoadDirection,
-    added,
-    moved,
-    only_in,
-)
+from psd_deflection.studies.discover.hidden import FIRST, SETUP, Direction, Free, LoadDirection, added, moved, only_in
 from psd_deflection.studies.discover.noise import NoiseModel, corners_of, estimate_noise
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, dot_rows, fine_means
