@@ -54,7 +54,6 @@ def test_readings_across_base_line_have_no_error() -> None:
     assert consistency.BaseLineExcess(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
 
 
-@pytest.mark.slow
 def test_the_state_follows_its_laws_through_any_blocks() -> None:
     """Chi-squares by chance around the limits, of either sign, for a while of one: each law written again."""
     rng = np.random.default_rng(11)
