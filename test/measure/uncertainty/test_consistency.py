@@ -198,7 +198,7 @@ def test_the_only_psd_to_blame_is_left_out_for_a_second(psd: int) -> None:
     blocks = 0
     while check(checks, with_error(psd, (0.0, 0.0)), {psd}).excluded:
         blocks += 1
-    assert blocks == consistency.HOLD - 1
+    assert blocks == 50 - 1
     # Without agreement it is not left out any longer.
     check(checks, with_error(psd, (1.0, 0.5), 2.0 * LIMIT), {psd})
     assert check(checks, with_error(psd, (0.0, 0.0)), set()).excluded == 0
