@@ -48,9 +48,8 @@ def installed_files() -> dict[str, Path]:
 def test_a_wheel_carries_what_ros2_run_looks_for() -> None:
     files = installed_files()
     assert 'share/ament_index/resource_index/packages/psd_deflection' in files
-    assert 'share/psd_deflection/package.xml' in files
-    assert 'share/psd_deflection/config/thesis_rig.yaml' in files
-    assert 'share/psd_deflection/launch/estimator.launch.py' in files
+    for path in ('package.xml', 'config/thesis_rig.yaml', 'launch/estimator.launch.py'):
+        assert f'share/psd_deflection/{path}' in files
     programs = {name.removeprefix('lib/psd_deflection/') for name in files if name.startswith('lib/psd_deflection/')}
     assert programs == set(EXECUTABLES)
     for name in EXECUTABLES:

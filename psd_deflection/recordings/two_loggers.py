@@ -215,7 +215,7 @@ def _offset(ours: LoggerTable, theirs: LoggerTable, first: str | Path, second: s
         if len(pieces) < 2:
             break
         # The pushes in a piece are not in its middle: only what is left of a rate is found without a bias.
-        clock = _along(clock, *np.array(pieces).T)
+        clock = along(clock, *np.array(pieces).T)
     return clock
 
 
@@ -244,7 +244,7 @@ def _shift(
     return fine if fine.unknown else fine._replace(seconds=coarse.seconds + fine.seconds)
 
 
-def _along(clock: ClockOffset, at: FloatArray, more: FloatArray, sd: FloatArray) -> ClockOffset:
+def along(clock: ClockOffset, at: FloatArray, more: FloatArray, sd: FloatArray) -> ClockOffset:
     """``clock`` with what it shows ``more`` at some times, as a straight line, or constant if that is as likely."""
     weights = sd**-2.0
     middle = float(weights @ at / weights.sum())

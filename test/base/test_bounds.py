@@ -64,10 +64,7 @@ def test_a_tally_counts_every_word_and_remembers_few() -> None:
     for n in range(1000):
         tally.add('known')
         tally.add(f'word {n}', 2)
-    assert len(tally) == 5
-    assert tally.total() == 3000
-    assert tally['known'] == 1000
-    assert tally[OTHERS] == 2 * (1000 - 3)
+    assert (len(tally), tally.total(), tally['known'], tally[OTHERS]) == (5, 3000, 1000, 2 * (1000 - 3))
     assert tally['never'] == 0
     assert 'never' not in tally
     assert dict(tally) == {'known': 1000, 'word 0': 2, 'word 1': 2, 'word 2': 2, OTHERS: 1994}

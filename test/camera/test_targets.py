@@ -396,7 +396,7 @@ def test_a_small_thing_beside_a_disc_is_noticed_in_a_large_image() -> None:
         (Status.HIDDEN, Scene(hide=((280.0, 90.0, 300.0, 110.0),))),
         (Status.OUTSIDE, Scene(aim=(0.0, 0.03))),
         (Status.DOUBLED, Scene(discs=4, radius=0.006, spacing=0.018)),
-        (Status.SMALL, Scene(distance=5.0)),
+        (Status.SMALL, Scene(distance=2.81)),  # A radius of 5.7 px.
         (Status.DEFOCUSED, Scene(blur=9.0)),
         (Status.OBLIQUE, Scene(tilt=(0.0, 1.1))),
         (Status.SATURATED, Scene(black=60.0, white=900.0)),

@@ -71,9 +71,7 @@ def test_what_is_no_reading_is_passed_over() -> None:
 def test_what_is_thrown_away_is_counted() -> None:
     decoder = apt.AptDecoder()
     # Three bytes begin no header; five are too few for one.
-    assert decoder.feed(bytes(8)) == []
-    assert decoder.reset() == 8
-    assert decoder.feed(REPLY[:10]) == []
+    assert (decoder.feed(bytes(8)), decoder.reset(), decoder.feed(REPLY[:10])) == ([], 8, [])
     assert decoder.reset() == 10
     assert [is_reply(m) for m in decoder.feed(REPLY)] == [True]
 

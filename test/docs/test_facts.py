@@ -5,17 +5,15 @@
 import ast
 import re
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 
-from psd_deflection.arms.compensation.settings import SHAPING
-from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.declarations import BY_NAME
-from psd_deflection.rig.parameters import Section
 from tools import gallery
 from tools.gallery import CASES, STUDIES, Case
 from tools.program import ROOT
@@ -58,28 +56,19 @@ def test_every_parameter_that_a_page_sets_is_declared() -> None:
     assert named <= set(BY_NAME)
 
 
-def rows(page: str) -> dict[str, list[str]]:
-    """The first three cells of each row whose first cell has names, by name; several names share a row."""
-    cells_by_name: dict[str, list[str]] = {}
-    for line in (ROOT / 'docs' / page).read_text('utf-8').splitlines():
-        cells = [cell.strip() for cell in line.strip('|').split('|')]
-        for name in re.findall('`([^`]+)`', cells[0]) if line.startswith('| `') else []:
-            cells_by_name[name] = cells[1:3]
-    return cells_by_name
+PROMISES = (ROOT / 'tools' / 'promises.txt').read_text('utf-8').splitlines()[2:]
 
 
-@pytest.mark.parametrize('name', ['max_step', 'lead'])
-def test_defaults_of_the_shaper_are_on_its_page(name: str) -> None:
-    stated = rows('shaping.md')[f'--{name.replace("_", "-")}'][0].split()[0]
-    assert float(stated) == SHAPING.parameters[name].default
-
-
-def test_defaults_of_the_camera_are_on_its_page() -> None:
-    stated = rows('camera.md')
-    declared = Section(CameraSettings).parameters
-    for names in (('spacing', 'radius'), ('square', 'marker', 'gap'), ('rotation',), ('exposure',), ('rest_frames',)):
-        given = [float(number) for number in stated[declared[names[0]].name][1].split(', ')]
-        assert given == [declared[name].default for name in names]
+@pytest.mark.parametrize('line', PROMISES)
+def test_a_promised_number_is_that_of_the_program(line: str) -> None:
+    """To 1 %: a page may round it."""
+    match = re.fullmatch(r'(.*?): (.*) = (.*?):(.*?)(?: \* (.*))?', line)
+    assert match is not None
+    page, words, module, name, factor = match.groups('1')
+    before, number, after = re.split('[{}]', words)
+    assert ' '.join((ROOT / 'docs' / page).read_text('utf-8').split()).count(before + number + after) == 1
+    ours = float(f'{{0.{name}}}'.format(import_module(module)))
+    assert float(re.sub('[ ,]', '', number)) * float(factor) == pytest.approx(ours, rel=0.01)
 
 
 RIG = str(ROOT / 'config' / 'thesis_rig.yaml')

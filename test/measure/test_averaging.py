@@ -37,9 +37,7 @@ def test_a_block_is_complete_with_its_last_sample() -> None:
     cutter = BlockCutter(20)
     assert cutter.add(*chunk_of(list(range(19)))) == []
     (block,) = cutter.add(*chunk_of([19]))
-    assert block.index == 0
-    assert block.seq.tolist() == list(range(20))
-    assert cutter.flush() == []
+    assert (block.index, block.seq.tolist(), cutter.flush()) == (0, list(range(20)), [])
 
 
 def test_a_block_in_one_piece_is_complete_at_once() -> None:

@@ -15,7 +15,7 @@ from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.read.csv_reader import CsvRecording
 from psd_deflection.recordings.time_shift import AT_REST, REPEATS, TimeShift, time_shift
-from psd_deflection.recordings.two_loggers import join
+from psd_deflection.recordings.two_loggers import ClockOffset, along, join
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import load_rig
 
@@ -109,6 +109,15 @@ def test_each_joined_sample_is_a_reading_of_both(tmp_path: Path, every: int, off
     for table, names in zip(tables, (['x1', 'y1', 'sum1'], ['x2', 'y2', 'sum2']), strict=True):
         rows = {tuple(row) for b in CsvRecording(table, part=True).blocks() for row in b.volts.tolist()}
         assert {tuple(row) for row in samples[names].tolist()} <= rows
+
+
+@pytest.mark.parametrize(('size', 'scatter'), [(3.0, 9.0 * 8.0 / 6.0), (0.3, 1.0)])
+def test_the_line_of_a_clock_is_as_sure_as_its_scatter_at_most(size: float, scatter: float) -> None:
+    """Eight offsets about a line leave six degrees of freedom; their places scatter by 42 about the middle."""
+    off = 1e-3 * size * np.resize([1.0, -1.0, -1.0, 1.0], 8)
+    clock = along(ClockOffset(0.0, 0.0), np.arange(8.0), 5e-3 * np.arange(8.0) + off, np.full(8, 1e-3))
+    assert (clock.at, clock.seconds, clock.rate) == pytest.approx((3.5, 17.5e-3, 5e-3))
+    assert (clock.sd, clock.rate_sd) == pytest.approx((1e-3 * (scatter / 8.0) ** 0.5, 1e-3 * (scatter / 42.0) ** 0.5))
 
 
 @pytest.mark.parametrize('ppm', [0, 40, 100, -200])

@@ -289,9 +289,8 @@ def test_goal_is_shaped_with_result_of_controller(begin: Begin) -> None:
     assert path.states[-1, 0].tolist() == [0.5, 0.1]
     assert path.duration == pytest.approx(0.3 + 0.0834, abs=1e-3)
     assert begun > 0.0
-    assert sent.path_tolerance == goal.path_tolerance
-    assert sent.goal_tolerance == goal.goal_tolerance
-    assert sent.goal_time_tolerance == goal.goal_time_tolerance
+    for of in ('path_tolerance', 'goal_tolerance', 'goal_time_tolerance'):
+        assert getattr(sent, of) == getattr(goal, of)
     assert arm.feedback[-1].feedback.joint_names == list(JOINTS)
     assert len(arm.feedback[-1].feedback.actual.positions) == 2
 

@@ -65,9 +65,11 @@ def gate(first: Mapping[str, object] | None = None, *, volts: bool = False) -> H
         ({'sample_rate_hz': HUGE}, "sample_rate_hz 'a whole number of 1027 bits', the rig file says 1000"),
         ({'sample_rate_hz': math.nan}, "sample_rate_hz 'nan', the rig file says 1000"),
         ({'sample_rate_hz': math.inf}, "sample_rate_hz 'inf'"),
+        ({'sample_rate_hz': 1001.1}, 'sample_rate_hz 1001.1, the rig file says 1000'),
         ({'sample_rate_hz': True}, 'sample_rate_hz True'),
         ({'sample_rate_hz': [1000]}, r'sample_rate_hz \[1000\]'),
         ({'sample_rate_hz': ...}, 'sample_rate_hz None'),
+        ({'volts_per_count': 1.0011 * VOLTS}, 'volts_per_count 0.0003055'),
         ({'volts_per_count': None}, 'volts_per_count None, needed is a number'),
         ({'volts_per_count': ...}, 'volts_per_count None, needed is a number'),
         ({'volts_per_count': HUGE}, "volts_per_count 'a whole number"),
@@ -106,7 +108,7 @@ def test_the_scale_stays_and_other_keys_may_change() -> None:
     with pytest.raises(DeviceError, match=r'volts_per_count 0.0003054.* now and had 0.00030517.* before'):
         taken.take(HelloFrame(1, info(volts_per_count=1.0009 * VOLTS)), 'port', volts=False)
     assert taken.volts_per_count == VOLTS
-    taken.take(HelloFrame(1, info(firmware='newer', uptime=5)), 'port', volts=False)
+    taken.take(HelloFrame(1, info(firmware='newer', uptime=5, sample_rate_hz=1000.9)), 'port', volts=False)
     assert taken.hello is not None
     assert taken.hello.info['uptime'] == 5
 

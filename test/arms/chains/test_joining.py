@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.arms.chains.chain import PATIENCE, Joined, Joiner
+from psd_deflection.arms.chains.chain import Joined, Joiner
 from psd_deflection.arms.chains.chain_file import ChainSettings, read_chain
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import DeflectionEstimate
@@ -84,7 +84,7 @@ def test_lost_block_of_other_link_leaves_gap_beside_it() -> None:
 def test_ended_link_is_dropped_and_joins_on_return() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
     got = run(joiner, {0: every(0, 40), 1: every(7_000_000, 5)})
-    assert [j.t_ns // BLOCK_NS for j in got if j.missing] == list(range(5, 39 - PATIENCE))
+    assert [j.t_ns // BLOCK_NS for j in got if j.missing] == list(range(5, 39 - 25))
     got = run(joiner, {0: every(40 * BLOCK_NS, 10), 1: every(40 * BLOCK_NS + 7_000_000, 10)})
     assert [j.t_ns // BLOCK_NS for j in got if j.tips] == list(range(41, 50))
     assert joiner.missing[1] == 36

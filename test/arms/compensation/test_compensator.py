@@ -701,7 +701,7 @@ def test_a_controller_of_another_sign_or_scale_holds(
             assert applies == 0.0 or how.get('output') == 'commands'
 
 
-@pytest.mark.parametrize(('applies', 'after'), [(1.0, State.FOLLOWING), (2.0, State.HOLDING)])
+@pytest.mark.parametrize(('applies', 'after'), [(1.06, State.FOLLOWING), (1.18, State.HOLDING)])
 def test_until_offsets_move_the_joints_nothing_is_verified(arm: Arm, applies: float, after: State) -> None:
     loop = Loop(arm, takeover=True, applies=applies)
     loop.measured = noisy(5e-5)

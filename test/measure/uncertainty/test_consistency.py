@@ -54,7 +54,6 @@ def test_readings_across_base_line_have_no_error() -> None:
     assert consistency.BaseLineExcess(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
 
 
-@pytest.mark.slow
 def test_the_state_follows_its_laws_through_any_blocks() -> None:
     """Chi-squares by chance around the limits, of either sign, for a while of one: each law written again."""
     rng = np.random.default_rng(11)
@@ -199,7 +198,7 @@ def test_the_only_psd_to_blame_is_left_out_for_a_second(psd: int) -> None:
     blocks = 0
     while check(checks, with_error(psd, (0.0, 0.0)), {psd}).excluded:
         blocks += 1
-    assert blocks == consistency.HOLD - 1
+    assert blocks == 50 - 1
     # Without agreement it is not left out any longer.
     check(checks, with_error(psd, (1.0, 0.5), 2.0 * LIMIT), {psd})
     assert check(checks, with_error(psd, (0.0, 0.0)), set()).excluded == 0

@@ -142,7 +142,8 @@ def test_a_dead_reading_is_no_better_than_a_converters_step() -> None:
     dots = coloured(4 * SEGMENT, 0.0, 17)
     dots[:, 3] = 0.0
     feed(noise, dots)
-    assert noise.mean_sd()[3] >= 1e-6 / 12.0**0.5
+    # The least noise of a sample, q^2/12, and what no mean removes, as much.
+    assert noise.mean_sd()[3] == pytest.approx(1e-6 * (1.05 / 12.0) ** 0.5, rel=3e-3)
     # If all are dead, nothing moves.
     noise = stream(step=1e-6)
     feed(noise, np.zeros((SEGMENT, 4)))
@@ -250,12 +251,12 @@ def test_a_segment_need_not_be_whole_to_be_of_its_place() -> None:
     """Segments are of 50 blocks by their numbers: what begins in the middle of one ends with it."""
     of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
     rng = np.random.default_rng(8)
-    reported = [b for b in range(20, 130) if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
-    assert reported == [49, 99]
+    reported = [(b, of.measured) for b in range(20, 130) if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert reported == [(49, False), (99, True)]
     # A block of a later segment closes one whose end was lost; too little of one changes nothing.
     of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
-    reported = [b for b in [*range(40), 51, *range(52, 60), 130] if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
-    assert reported == [51]
+    closed = [b for b in [*range(40), 51, *range(52, 60), 130] if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert closed == [51]
 
 
 FILE, COARSEST = 20.0 / 2**16, 20.0 / 2**8
@@ -558,6 +559,9 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
         if phase in (2, 5) and block % 5 == 0:
             dots[size // 3 :] += SIGMA * rng.choice([3.0, 8.0, 30.0]) * rng.normal(size=4)
         slots = np.arange(size)
+        if block == 5:
+            # Those of the mean that lasts are 250 at most.
+            fit.memory.lasting[1] = dense.blocks[:] = 248.0
         if phase in (3, 4, 5):
             slots = np.sort(rng.choice(size, int(rng.integers(1, size + 1)), replace=False))
         if phase > 5:

@@ -16,6 +16,7 @@ from psd_deflection.measure.averaging import SEGMENT_BLOCKS
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.block_estimator import VIBRATION
 from psd_deflection.measure.uncertainty.block_fit import BlockFit
+from psd_deflection.measure.uncertainty.drift import Drift
 from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.vibration import Tone, Tones, ToneSearch, rms_of, words_of
 from psd_deflection.records import FloatArray, IntArray, RawChunk, Record, TipMotion
@@ -199,6 +200,8 @@ def test_slow_motion_steps_and_regular_gaps_make_no_tone() -> None:
     assert not moving_tones((noise(1) + ramp)[here], noise(2)[here], here)
     # Lines across gaps left 30 um.
     assert not moving_tones((noise(1) + slow)[here], noise(2)[here], here)
+    # At half the sample rate both halves of a tone are one.
+    assert not moving_tones(noise(1) + 5e-6 * (-1.0) ** ALL[:, None], noise(2))
 
 
 def test_too_short_segments_have_no_tones() -> None:
@@ -262,6 +265,18 @@ def test_readings_that_drift_say_so(readings: list[int]) -> None:
     s = drifting(readings, 30)
     assert s.reported > 0.95
     assert drifting([], 30).named < 0.01
+
+
+@pytest.mark.parametrize(('rise', 'segments', 'reported'), [(1.89, 5, False), (1.91, 4, False), (1.91, 5, True)])
+def test_a_drift_is_of_five_to_twenty_segments(rise: float, segments: int, reported: bool) -> None:
+    """The slope of five means is known to 0.316 of their sd; six of its own make it a drift."""
+    of, still = Drift(1), Drift(1)
+    for k in range(segments):
+        of.add(np.array([rise * k]), np.ones(1))
+    assert (of.slope != 0.0) == reported
+    for k in range(60):
+        still.add(np.array([10.0 * min(k, 39)]), np.ones(1))
+    assert still.slope == 0.0
 
 
 def shaking(seconds: int, hz: float = 87.0) -> FloatArray:

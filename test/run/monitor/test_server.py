@@ -353,9 +353,7 @@ def test_bad_requests_get_an_answer_and_no_log_line(
     with socket.create_connection(('127.0.0.1', serving.port), WAIT_S) as stranger:
         stranger.sendall(f'{request_line} HTTP/1.1\r\n{head}Connection: close\r\n\r\n'.encode() + rest)
         answer = stranger.makefile('rb').readline()
-    assert int(answer.split()[1]) == status
-    assert caplog.records == []
-    assert len(serving.logged) == 1
+    assert (int(answer.split()[1]), caplog.records, len(serving.logged)) == (status, [], 1)
     assert ask(serving.url, 'GET')[0] == 200
 
 

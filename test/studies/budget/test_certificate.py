@@ -307,9 +307,7 @@ def test_the_files_have_all_digits(certificate: Certificate) -> None:
 def test_the_tree_and_the_table_have_the_same_numbers(certificate: Certificate) -> None:
     answer = _certified(certificate, limits=LIMITS, fields={'number': 'A-17'})
     tree = json.loads(answer.json())
-    assert tree['limits'] == list(LIMITS)
-    assert tree['probability'] == 0.95
-    assert tree['range'] == _tree()['range']
+    assert (tree['limits'], tree['probability'], tree['range']) == (list(LIMITS), 0.95, _tree()['range'])
     assert tree['provenance'] == {'version': __version__, 'calibration': _tree()['provenance']}
     assert tree['fields']['number'] == 'A-17'
     assert np.array(tree['correlations']) == pytest.approx(certificate.correlations, abs=0.0)

@@ -411,9 +411,7 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     assert checkup.findings[0].evidence > 1.0
     assert checkup.findings[0].equivalent == ()
     two = checked(three[:2])
-    assert two.verdict == WRONG
-    assert dict(two.values) == {}
-    assert len(two.wirings) == 2
+    assert (two.verdict, dict(two.values), len(two.wirings)) == (WRONG, {}, 2)
     assert two.findings[0].equivalent == ('1 other wiring, which these pushes cannot tell apart',)
     single = checked(three[:1])
     count = len(single.wirings) - 1

@@ -10,6 +10,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.signal import lfilter, welch
 from scipy.signal.windows import hann
+from scipy.stats import gamma
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import spectra
@@ -231,5 +232,8 @@ def test_a_steady_swing_is_no_driven_mode() -> None:
 def test_ratios_as_they_should_be_pass() -> None:
     rng = np.random.default_rng(6)
     assert sum(spectra.scatters_as_exponential(rng.exponential(size=200)) for _ in range(40)) >= 39
+    # One of 50 pieces of four may be as unlikely as 1e-5.
+    for tail, passes in ((1e-5, True), (2e-6, False)):
+        assert spectra.scatters_as_exponential(np.r_[[gamma.isf(tail, 4) / 4.0] * 4, np.ones(196)]) == passes
     assert not spectra.scatters_as_exponential(1.5 * rng.exponential(size=1000))
     assert not spectra.scatters_as_exponential(np.ones(1000) + 1e-3 * rng.normal(size=1000) + 0.8)
