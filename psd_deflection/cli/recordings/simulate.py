@@ -103,6 +103,7 @@ def run_device(args: argparse.Namespace) -> int:
         names = ','.join(port.name for port in ports)
         print(f'{PORT_LINE}{names}', flush=True)
         source = '' if name == 'serial' else f' --source {name}'
+        source += f' --params-file {shlex.quote(args.params_file)}' if args.params_file else ''
         reached = shlex.quote(','.join(link or port.name for link, port in zip(links, ports, strict=True)))
         print(
             f'a simulated rig answers there; try:  {program()} estimator --port {reached}{source}\nCtrl-C ends it',

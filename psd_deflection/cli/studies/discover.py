@@ -23,8 +23,8 @@ REC may also be a table of readings: a .csv with one row for each load that was 
 tables have no set-up check, law or --next.
 
 A table of another machine: --inputs and --outputs name its columns, and the answer is which terms of the inputs
-(powers, sines and cosines of angles, products) the outputs follow. Rows with the same text in column --parts are held
-out together.
+(powers, sines and cosines of angles, products; sizes in the units of the columns) the outputs follow. Rows with
+the same text in column --parts are held out together. DIR gets no model.yaml.
 
 All REC together are one experiment. With --each every REC, or .yaml list, is one for itself: DIR/REC gets its files, or
 X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
@@ -50,7 +50,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from psd_deflection.base.errors import ConfigError, UsageError
+from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.text import plain_number
 from psd_deflection.cli._many import FLEET, absolute, each_for_itself, each_option
 from psd_deflection.cli._options import (
@@ -289,7 +289,12 @@ def run(args: argparse.Namespace) -> int:
             in_tables = asked.discovered_in_tables(tables, warn)
         return _answered(args, in_tables, in_tables.files(), [])
     with stage('reading', quiet=args.quiet or args.json):
-        observations = asked.read(args.recordings, warn)
+        try:
+            observations = asked.read(args.recordings, warn)
+        except RecordingError as error:
+            if 'the header lacks' not in str(error):
+                raise
+            raise RecordingError(f'{error}; of another machine? Name its columns by --inputs and --outputs') from None
     make_writable(args.out)
     with _progress(args) as progress:
         discovery = _searched(args, asked, observations, limits, progress)

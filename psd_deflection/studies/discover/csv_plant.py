@@ -27,18 +27,18 @@ _REACH = 20.0
 """Largest size of a term, in standard deviations of the output."""
 
 
-class _Range(NamedTuple):
-    """Middle of an input, and half of its range: its scaled value is from -1 to 1."""
+class _Term(NamedTuple):
+    """``values`` (n,), and ``unit``, '' for a number without one."""
 
-    middle: float
-    half: float
+    values: FloatArray
+    unit: str
 
 
 class CsvPlant(Plant):
     """A table: ``outputs`` as an offset plus terms of the ``inputs``.
 
-    A number u is scaled to its range, v = (u - middle) / half, so that a size is what its term does at the ends of the
-    range, in the unit of the output: v, v^2, v^3. An angle has the terms sin, cos, sin 2u, cos 2u; a sign has sgn(u).
+    A number u has the terms u, u^2 and u^3; u counts from a round number in the middle of its range, which the term
+    names, "(u - 20)^2", if 0 is not near it. An angle has the terms sin, cos, sin 2u, cos 2u; a sign has sgn(u).
     Products of two inputs' first terms are terms too. Units are in brackets in the header: "el [deg]".
     """
 
@@ -52,7 +52,7 @@ class CsvPlant(Plant):
         parts: str = '',
         kinds: Mapping[str, str] | None = None,
         noise: Sequence[float] = (),
-        ranges: Mapping[str, _Range] | None = None,
+        middles: Mapping[str, float] | None = None,
     ) -> None:
         """``parts``: a column; rows with the same text in it are left out of the fit together. ``kinds``: of an input,
         one of ``KINDS``; a unit of deg or rad is recognised. ``noise``: rms of each output, if it is known.
@@ -75,22 +75,24 @@ class CsvPlant(Plant):
         )
         order = list(dict.fromkeys(texts))
         self._parts: IntArray = np.array([order.index(text) for text in texts])
-        self._ranges = dict(
-            ranges or {n: _Range((u.min() + u.max()) / 2, np.ptp(u) / 2) for n, u in self._inputs.items()}
-        )
+        self._middles = dict(middles or {name: _middle(u) for name, u in self._inputs.items()})
+        self._units = {_bare(n): _unit(n) for n in inputs}
         self._terms = self._terms_of({_bare(n): (kinds or {}).get(n) or _kind(n) for n in inputs})
         sd = np.nanstd(self._outputs, axis=1) + 1e-300
-        effects = {
-            f'{output}: {term}': EffectParameter('size', unit, -_REACH * s, _REACH * s, s, f'{term} of {output}')
-            for output, unit, s in zip(self.channels, self.units, sd.tolist(), strict=True)
-            for term in ('offset', *self._terms)
-        }
+        effects: dict[str, EffectParameter] = {}
+        for output, unit, of_output in zip(self.channels, self.units, sd.tolist(), strict=True):
+            for name, term in {'offset': _Term(np.ones(1), ''), **self._terms}.items():
+                scale = of_output / float(np.sqrt(np.mean(term.values**2)) + 1e-300)
+                full_unit = f'{unit or 1}/{term.unit}' if term.unit else unit
+                words = f'{name} in {output}'
+                parameter = EffectParameter('size', full_unit, -_REACH * scale, _REACH * scale, scale, words)
+                effects[f'{output}: {name}'] = parameter
         self.library = tuple(plant_effect(n, p) for n, p in effects.items() if not n.endswith(': offset'))
         self.nuisance = tuple(plant_effect(n, p) for n, p in effects.items() if n.endswith(': offset'))
 
     def like(self, path: str | Path) -> CsvPlant:
         """Return another table with the columns and the terms of this one."""
-        return CsvPlant(path, *self._arguments, ranges=self._ranges)
+        return CsvPlant(path, *self._arguments, middles=self._middles)
 
     def measured(self) -> Sequence[FloatArray]:
         """Return the outputs."""
@@ -109,33 +111,48 @@ class CsvPlant(Plant):
         out = np.zeros((len(self.channels), len(self._parts)))
         for name, values in model.items():
             output, term = name.split(': ')
-            out[self.channels.index(output)] += values['size'] * (1.0 if term == 'offset' else self._terms[term])
+            out[self.channels.index(output)] += values['size'] * (1.0 if term == 'offset' else self._terms[term].values)
         return [out]
 
-    def _terms_of(self, kinds: Mapping[str, str]) -> dict[str, FloatArray]:
-        first, further = dict[str, dict[str, FloatArray]](), dict[str, FloatArray]()
+    def _terms_of(self, kinds: Mapping[str, str]) -> dict[str, _Term]:
+        first, further = dict[str, dict[str, _Term]](), dict[str, _Term]()
         for name, kind in kinds.items():
-            u, (middle, half) = self._inputs[name], self._ranges[name]
+            u, middle, unit = self._inputs[name], self._middles[name], self._units[name]
             if kind not in KINDS:
                 raise ConfigError(f'kinds: {name} = {kind!r}: must be one of {", ".join(KINDS)}')
-            if half == 0.0:
+            if np.ptp(u) == 0.0:
                 continue  # A constant is in the offset.
             if kind in ('degrees', 'radians'):
                 angle = np.radians(u) if kind == 'degrees' else u
-                first[name] = {f'sin {name}': np.sin(angle), f'cos {name}': np.cos(angle)}
-                further |= {f'sin 2 {name}': np.sin(2.0 * angle), f'cos 2 {name}': np.cos(2.0 * angle)}
+                first[name] = {f'sin {name}': _Term(np.sin(angle), ''), f'cos {name}': _Term(np.cos(angle), '')}
+                further[f'sin 2 {name}'] = _Term(np.sin(2.0 * angle), '')
+                further[f'cos 2 {name}'] = _Term(np.cos(2.0 * angle), '')
                 continue
-            v = (u - middle) / half
-            first[name] = {name: v}
-            further |= {f'{name}^2': v**2, f'{name}^3': v**3}
+            v, label = u - middle, f'({name} - {middle:g})' if middle else name
+            first[name] = {label: _Term(v, unit)}
+            further |= {f'{label}^{k}': _Term(v**k, f'{unit}^{k}' if unit else '') for k in (2, 3)}
             if kind == 'sign':
-                further[f'sign {name}'] = np.sign(u)
+                further[f'sign {name}'] = _Term(np.sign(u), '')
         products = {
-            f'{a} * {b}': x * y
+            f'{a} * {b}': _Term(x.values * y.values, _product(x.unit, y.unit))
             for left_terms, right_terms in itertools.combinations(first.values(), 2)
             for (a, x), (b, y) in itertools.product(left_terms.items(), right_terms.items())
         }
         return {k: v for terms in first.values() for k, v in terms.items()} | further | products
+
+
+def _product(a: str, b: str) -> str:
+    return f'({a} {b})' if a and b else a or b
+
+
+def _middle(u: FloatArray) -> float:
+    """Return a round number in the middle of the range of ``u``; 0 if that is within a tenth of it."""
+    half = float(np.ptp(u)) / 2.0
+    middle = float(u.min()) + half
+    if abs(middle) <= 0.2 * half:
+        return 0.0
+    digit = 10.0 ** math.floor(math.log10(half)) if half else 1.0
+    return round(middle / digit) * digit
 
 
 def _unit(name: str) -> str:

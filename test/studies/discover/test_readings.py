@@ -492,7 +492,7 @@ def test_terms_of_any_table_are_named_and_predict(tmp_path: Path, capsys: pytest
         (tmp_path / name).write_text('\n'.join([','.join([*names, 'd [mm]', 'day']), *part]))
     asked: dict[str, Any] = {'inputs': names, 'outputs': ['d [mm]'], 'parts': 'day', 'kinds': {'way': 'sign'}}
     discovery = psd_deflection.discover_in(tmp_path / 'a.csv', **asked)
-    assert {e.active.effect.name for e in discovery.effects} == {'d: sin az', 'd: force^2'}
+    assert {e.active.effect.name for e in discovery.effects} == {'d: sin az', 'd: (force - 20)^2'}
     (predicted,) = discovery.predict(tmp_path / 'b.csv')
     assert np.sqrt(np.mean((predicted[0] - y[60:]) ** 2)) < 0.08
     words = ['--inputs', ','.join(names), '--outputs', 'd [mm]', '--parts', 'day', '--out', str(tmp_path / 'out')]
