@@ -13,6 +13,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from operator import methodcaller
 from pathlib import Path
 
 import zstandard
@@ -123,11 +124,10 @@ def bag_target() -> tuple[Target, list[bytes]]:
 
 def csv_target() -> tuple[Target, list[bytes]]:
     from psd_deflection.recordings.read.readers import open_recording
-    from psd_deflection.recordings.recording import Recording
 
     seed = b't,x1,y1,sum1,x2,y2,sum2,load_fx,load_fy,load_tz\n'
     seed += b''.join(b'%d.%03d,0,1e-3,5,-1,2,5,1,0,0\n' % (i // 1000, i % 1000) for i in range(30))
-    parts = (Recording.blocks, Recording.loads, Recording.references, Recording.temperatures)
+    parts = [methodcaller(name) for name in ('blocks', 'loads', 'references', 'temperatures')]
     return _file_target('.csv', *(lambda path, part=part: list(part(open_recording(path))) for part in parts)), [seed]
 
 

@@ -10,7 +10,7 @@ is hum of the electronics and no motion (:class:`Hum`): its autocovariance is a 
 without a tone is found where readings of two PSDs vary together over a group of bins, and the sums do not.
 
 Noise alone makes a bin exceed its floor T times with probability exp(-T); the floor of 50 neighbours is uncertain by
-1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 40 in some thousand hours.
+1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 28 in some 300 hours.
 Slow motion is kept out by a Hann window (periodic), whose lobes fall as the cube of the distance; gaps are bridged by
 cubics, so that a regular gap makes no tone of a slow motion.
 
@@ -31,7 +31,7 @@ from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.base.arithmetic.spectra import transform
 from psd_deflection.records import FloatArray, IntArray, dot_names
 
-SIGNIFICANT = 40.0
+SIGNIFICANT = 28.0
 """Times the floor about it: a peak is a tone."""
 
 _OBSERVED = 12.0
