@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.stats import poisson
 
 from blind import generator
 from blind import motion as moving
-from blind.campaign import chunk, options, over
+from blind.campaign import options, over
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk, SpotMeans
@@ -41,10 +42,8 @@ IN_STEP = {'14 to 19': range(14, 20), '12 to 19': range(12, 20), '0 to 7': range
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One rig: rms noise of each channel V, AR(1) memory, tails, hum V at ``mains`` Hz, converter, offsets of x1, y1,
-    x2, y2 V.
-    ``stated``: the rig file names the noise of each channel. ``corner``: Hz, at which 1/f noise is as much as the
-    white."""
+    """One rig: rms noise of each channel V, AR(1) memory, hum V at ``mains`` Hz, converter, offsets of x1, y1, x2, y2 V.
+    ``stated``: the rig file has that noise. ``corner``: Hz, where 1/f noise is as much as the white."""
 
     label: str
     sigmas: tuple[float, ...] = (2e-3,) * 6
@@ -60,13 +59,10 @@ class Row:
 
 ROWS = (
     Row('white'),
-    Row('AR(1) 0.3', memory=0.3),
-    Row('AR(1) 0.6', memory=0.6),
-    Row('AR(1) 0.9', memory=0.9),
+    *(Row(f'AR(1) {memory}', memory=memory) for memory in (0.3, 0.6, 0.9)),
     Row('twice the noise', sigmas=(4e-3,) * 6),
     *(Row(f'hum 10 mV, {hz:g} Hz', hum=10e-3, mains=hz) for hz in (49.5, 49.9, 50.0, 50.1, 50.5, 60.0)),
-    Row('12 bit', bits=12),
-    Row('24 bit', bits=24),
+    *(Row(f'{bits} bit', bits=bits) for bits in (12, 24)),
     Row('heavy tails', heavy=True),
     Row('offsets, zeroed', offsets=(1e-3, -2e-3, 0.5e-3, 1.5e-3)),
     Row('1, 2, 4, 2 mV', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3)),
@@ -74,8 +70,7 @@ ROWS = (
 )
 UNEQUAL = ROWS[-1]
 HUMS = (1.0, 0.8, 1.0, 0.9, 1.1, 1.0)  # Shares of the hum that the channels have.
-SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))
-"""What the estimates do not cover in full."""
+SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))  # Not covered in full.
 TONES = (5.0, 14.0, 20.0, 28.0, 36.0, 44.0, 48.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)  # Hz of a steady vibration.
 SHAKEN = (8e-6, 20e-6, 0.1e-3)  # Its amplitudes: dX, dY m, theta rad, each with a phase of its own.
 SIZES = (0.015, 0.05, 0.15, 1.0)  # Times these.
@@ -133,8 +128,7 @@ class Run(NamedTuple):
 
     def inside(self, first: int = 0, last: int | None = None) -> Inside:
         """Score the blocks from ``first`` to before ``last``."""
-        here = (self.block >= first) & (self.block < (self.block[-1] + 1 if last is None else last))
-        return inside(self.error[here], self.covariance[here], np.array([bool(f) for f in self.findings])[here])
+        return pooled([self], first, last)
 
 
 class Scored(NamedTuple):
@@ -145,15 +139,18 @@ class Scored(NamedTuple):
     alarms: float
 
 
-def inside(error: Array, covariance: Array, named: npt.NDArray[np.bool_] | None = None) -> Inside:
-    """``error`` (n, 3), ``covariance`` (n, 3, 3), ``named`` (n,): which have a finding."""
+def pooled(runs: Sequence[Run], first: int = 0, last: int | None = None) -> Inside:
+    """Score all ``runs`` together, of each the blocks from ``first`` to before ``last``."""
+    here = [(r.block >= first) & (r.block < (r.block[-1] + 1 if last is None else last)) for r in runs]
+    error = np.concatenate([r.error[h] for r, h in zip(runs, here, strict=True)])
+    covariance = np.concatenate([r.covariance[h] for r, h in zip(runs, here, strict=True)])
+    named = np.concatenate([np.array(r.findings)[h] != '' for r, h in zip(runs, here, strict=True)])
     sd = np.sqrt(np.einsum('nii->ni', covariance))
     size = np.abs(error) / sd
     joint = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     a, b, c = (size < 1.959964).mean(axis=0).tolist()
     x, y, t = np.sqrt((error**2).mean(axis=0)).tolist()
     u, v, w = np.median(sd, axis=0).tolist()
-    named = np.zeros(len(error), bool) if named is None else named
     outliers = (size > 3.0).any(axis=1)
     reported = float(named[outliers].mean()) if outliers.any() else float('nan')
     errors = size[~named].size
@@ -174,21 +171,21 @@ def rig(row: Row, **overrides: object) -> Rig:
     return load_rig(overrides={**values, **overrides})
 
 
-@cache
-def motion(rest_s: int, steps: int, every_s: int = 5, size: int = SIZE) -> tuple[Array, Array]:
-    """Volts (n, 6) without noise and poses at the middles of blocks of ``size``."""
-    fine = stepped(rest_s, steps, every_s)
-    return optics_of(fine), middles(fine, size)
-
-
 def stepped(rest_s: int, steps: int, every_s: int = 5) -> Array:
-    """Poses on the fine grid: at rest, then 50 N on and off."""
+    """Poses on the fine grid: at rest, then 50 N on the sidebar on and off ``every_s``."""
     n, dwell = rest_s * 1000, every_s * 1000
     loads = np.zeros((n + steps * dwell, 3))
     for step in range(0, steps, 2):
         # Off the blocks' grid, each at another place in its block.
         loads[n + step * dwell + 7 * step % SIZE :][:dwell] = (0.0, -50.0, -29.25)
     return generator.motion(loads, 0.585, [])
+
+
+@cache
+def motion(rest_s: int, steps: int, every_s: int = 5, size: int = SIZE) -> tuple[Array, Array]:
+    """Volts (n, 6) without noise and poses at the middles of blocks of ``size``."""
+    fine = stepped(rest_s, steps, every_s)
+    return optics_of(fine), middles(fine, size)
 
 
 def optics_of(fine: Array, warm: Array | None = None, effects: Sequence[generator.Spec] = ()) -> Array:
@@ -280,8 +277,7 @@ def drifting(readings: Sequence[int], seconds: int = 60, seed: int = 1) -> Insid
     """At rest, while the dots' ``readings`` (0 to 3: x1, y1, x2, y2) drift by 0.02 um/s."""
     fine = np.zeros((seconds * 1000 * generator.FINER, 3))
     clean = optics_of(fine)
-    slope = np.zeros(6)
-    slope[[(0, 1, 3, 4)[k] for k in readings]] = 2e-8 / generator.MM_PER_V
+    slope = np.isin(np.arange(6), [(0, 1, 3, 4)[k] for k in readings]) * 2e-8 / generator.MM_PER_V
     volts = volts_of(ROWS[0], clean + slope * (np.arange(len(clean)) / generator.RATE)[:, None], seed)
     return run(Pipeline(rig(ROWS[0])), volts, middles(fine)).inside(2 * SETTLED)
 
@@ -317,24 +313,17 @@ def on_a_moving_base(seconds: int = 60, seed: int = 1) -> Inside:
     return _compared(pipeline, records, generator.between(made.pose)).inside(int(moving.REST * generator.RATE) // SIZE)
 
 
-class Shaken(NamedTuple):
-    """A link that vibrates steadily; ``words``: the last block's finding."""
-
-    inside: Inside
-    words: str
-
-
-def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, size: float = 1.0) -> Shaken:
+def shaken(hz: float, seconds: int = 60, seed: int = 1, size: float = 1.0) -> Run:
     """A link without load that vibrates with that frequency and ``size`` times ``SHAKEN``, from the first sample on."""
-    got = _shaken(hz, row, seconds, seed, size)
-    return Shaken(got.inside(2 * SETTLED), got.findings[-1])
-
-
-def _shaken(hz: float, row: Row, seconds: int, seed: int, size: float) -> Run:
     t = np.arange(seconds * int(generator.RATE) * generator.FINER) / (generator.RATE * generator.FINER)
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 3)
     fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN * size
-    return run(Pipeline(rig(row)), volts_of(row, optics_of(fine), seed), middles(fine))
+    return run(Pipeline(rig(ROWS[0])), volts_of(ROWS[0], optics_of(fine), seed), middles(fine))
+
+
+def tones(hz: float, size: float) -> Inside:
+    """Eight runs of 16 s of :func:`shaken`, each with phases and noise of its own."""
+    return pooled([shaken(hz, 16, seed, size) for seed in range(1, 9)], 2 * SETTLED)
 
 
 def random_motion(low: float, high: float, rms: float, seconds: int = 60, seed: int = 1) -> Inside:
@@ -359,7 +348,7 @@ def coarse(poses: int = 150, seed: int = 1, *, reported: bool = True, **override
         pose = rng.uniform(-1.0, 1.0, 3) * (1e-3, 1e-3, 1e-2)
         volts = volts_of(row, optics_of(np.tile(pose, (120 * SIZE * generator.FINER, 1))), int(rng.integers(1 << 30)))
         runs.append(run(Pipeline(rig(row, **more)), volts, np.tile(pose, (120, 1))))
-    return inside(*(np.concatenate([getattr(r, name)[100:] for r in runs]) for name in ('error', 'covariance')))
+    return pooled(runs, 100)
 
 
 def bound(row: Row) -> Array:
@@ -371,18 +360,12 @@ def bound(row: Row) -> Array:
     return np.asarray(np.sqrt(np.linalg.inv((a.T / variances) @ a).diagonal()))
 
 
-def over_the_bound(
-    row: Row, solvers: Sequence[str], rest_s: int = 400, seed: int = 1, **more: object
-) -> dict[str, Array]:
+def over_the_bound(row: Row, solvers: Sequence[str], rest_s: int = 400, seed: int = 1) -> dict[str, Array]:
     """rms error (3,) of each solver on a link at rest over :func:`bound`."""
-    n = rest_s * 1000
-    volts = volts_of(row, optics_of(np.zeros((n * generator.FINER, 3))), seed)
-    chosen = {'solver': solvers[0], 'solvers': list(solvers), **more}
-    poses: dict[str, list[tuple[float, float, float]]] = {name: [] for name in solvers}
-    for r in Pipeline(rig(row, **chosen)).process(chunk(volts)):
-        if isinstance(r, DeflectionEstimate):
-            poses[r.solver].append((r.dx, r.dy, r.theta))
-    return {name: np.sqrt(np.square(solved).mean(axis=0)) / bound(row) for name, solved in poses.items()}
+    fine = np.zeros((rest_s * 1000 * generator.FINER, 3))
+    volts, truth = volts_of(row, optics_of(fine), seed), middles(fine)
+    errors = {name: run(Pipeline(rig(row, solver=name, solvers=[name])), volts, truth).error for name in solvers}
+    return {name: np.sqrt(np.square(error).mean(axis=0)) / bound(row) for name, error in errors.items()}
 
 
 def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int = 1) -> tuple[float, str]:
@@ -401,8 +384,7 @@ def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int =
     elif kind in ('dead', 'inverted'):
         volts[:, column] = 0.0 if kind == 'dead' else -volts[:, column]
     else:
-        pair = [3 * channel, 3 * channel + 1]
-        volts[:, pair] = volts[:, pair[::-1]]
+        volts[:, [3 * channel, 3 * channel + 1]] = volts[:, [3 * channel + 1, 3 * channel]]
     # Zeroed as it is: the readings at rest are what they are then.
     pipeline = Pipeline(rig(Row(kind)))
     got = run(pipeline, volts, truth, zero_at=SETTLED // 2)
@@ -418,30 +400,17 @@ WRONG += [('swapped', psd) for psd in range(2)]
 def one_wrong(rows: int | None) -> int:
     """Print :func:`fault` for every wrong reading, or the first so many, at 10, 30 and 50 N."""
     print('| wrong | load | largest error, own sd | named |\n|---|---|---|---|')
-    for kind, channel in WRONG[:rows]:
-        for force in (10.0, 30.0, 50.0):
-            for name, load in (('sidebar', (0.0, -force, -0.585 * force)), ('link', (0.0, -force, 0.0))):
-                worst, named = fault(kind, channel, load)
-                words = f'{kind} {channel} | {force:g} N, {name} | {worst:.1f} | {named or "cannot be determined"}'
-                print(f'| {words} |', flush=True)
+    for (kind, channel), force, arm in product(WRONG[:rows], (10.0, 30.0, 50.0), (0.585, 0.0)):
+        worst, named = fault(kind, channel, (0.0, -force, -arm * force))
+        place = 'sidebar' if arm else 'link'
+        print(
+            f'| {kind} {channel} | {force:g} N, {place} | {worst:.1f} | {named or "cannot be determined"} |', flush=True
+        )
     return 0
 
 
-def tones(hz: float, size: float) -> Inside:
-    """Eight runs of 16 s of :func:`shaken`, each with phases and noise of its own."""
-    runs = [_shaken(hz, ROWS[0], 16, seed, size) for seed in range(1, 9)]
-    later = np.concatenate([run.block for run in runs]) >= 2 * SETTLED
-    named = np.array([bool(f) for r in runs for f in r.findings])[later]
-    error, covariance = (np.concatenate([getattr(r, n) for r in runs])[later] for n in ('error', 'covariance'))
-    return inside(error, covariance, named)
-
-
+SHORT = {'rest_s': 40, 'steps': 8}  # Of a run whose blocks are many.
 Case = tuple[str, str, Callable[..., Inside | Scored], tuple[object, ...], dict[str, object]]
-
-
-def shorter(size: int) -> dict[str, object]:
-    """Return the length of a run whose blocks are many."""
-    return {'rest_s': 40, 'steps': 8} if size <= 60 else {}
 
 
 def cases() -> list[Case]:
@@ -449,13 +418,15 @@ def cases() -> list[Case]:
     out: list[Case] = [(row.label, loss, score, (row, loss), {}) for row in ROWS for loss in LOSSES]
     out += [('lost in step', label, score, (ROWS[0], label), {}) for label in IN_STEP]
     out += [(row.label, 'none', score, (row, 'none'), {}) for row in SLOW]
-    out += [(f'block_size {n}', '', score, (ROWS[0], 'none'), {'size': n, **shorter(n)}) for n in range(1, 201)]
+    out += [
+        (f'block_size {n}', '', score, (ROWS[0], 'none'), {'size': n, **(SHORT if n <= 60 else {})})
+        for n in range(1, 201)
+    ]
     out += [(f'{hz:g} Hz', f'{20.0 * size:g} µm', tones, (hz, size), {}) for size in SIZES for hz in TONES]
     out += [(f'{t:g} times the noise', f'a load every {s} s', louder, (t, s), {}) for t in LOUDER for s in EVERY]
     names = {'x1': [0], 'y1': [1], 'x1 and x2': [0, 2], 'y1 and y2': [1, 3], 'x1 and y2': [0, 3], 'all': [0, 1, 2, 3]}
     out += [('drift 0.02 µm/s', name, drifting, (which,), {}) for name, which in names.items()]
-    out += [('temperature ramp', 'drift in the rig file', warming, (), {})]
-    out += [('temperature ramp', 'drift not in the rig file', warming, (False,), {})]
+    out += [('temperature ramp', f'drift {k} the rig file', warming, (k == 'in',), {}) for k in ('in', 'missing from')]
     out += [(f'random, {a} to {b} Hz', f'{1e6 * rms:g} µm', random_motion, (a, b, rms), {}) for a, b, rms in RANDOM]
     out += [('moving base', '', on_a_moving_base, (), {}), ('10 bit, no dither', '', coarse, (), {})]
     return [*out, ('10 bit', 'the rig file says 16', coarse, (), {'reported': False})]

@@ -11,12 +11,11 @@ from pathlib import Path
 
 # The word that is no longer used, and what the field writes.
 _WORDS = """
-refused:rejected refuse:reject refuses:rejects refusal:rejection told:reported tells:reports seen:observed
-said:message hung:applied noted:annotated unnoted:unannotated acted:effective mended:corrected wire:sink
-wires:sinks say:log says:description unsaid:significant ear:probe ears:probes hear:feed rival:alternative
-rivals:alternatives lattice:value_grid gathered:buffered foretold:predicted coasts:predictions_only
-suspect:candidate suspects:candidates judge:classify judges:classifies judged:classified whole:full
-freed:with_free turned:rotated
+refused:rejected refuse:reject refuses:rejects refusal:rejection told:reported tells:reports seen:observed said:message
+hung:applied noted:annotated unnoted:unannotated acted:effective mended:corrected wire:sink wires:sinks say:log
+says:description unsaid:significant ear:probe ears:probes hear:feed rival:alternative rivals:alternatives
+lattice:value_grid gathered:buffered foretold:predicted coasts:predictions_only suspect:candidate suspects:candidates
+judge:classify judges:classifies judged:classified whole:full freed:with_free turned:rotated
 """
 # These only as the whole of an identifier.
 _EXACT = """
@@ -36,17 +35,14 @@ ROOMS = ('psd_deflection', 'msg_adapters', 'launch', 'test', 'bench', 'blind', '
 def uses_of(text: str) -> Counter[str]:
     """Return the uses of each finished word in the identifiers of Python source ``text``."""
     tokens = [t for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.NAME]
-    names = [
-        t.string
-        for t in tokens
-        if not FOREIGN & {t.string, t.line[t.start[1] - 1 : t.end[1]], t.line[t.start[1] : t.end[1] + 1]}
-    ]
+    around = [(t.string, t.line[t.start[1] - 1 : t.end[1]], t.line[t.start[1] : t.end[1] + 1]) for t in tokens]
+    names = [name for name, before, after in around if not FOREIGN & {name, before, after}]
     parts = (
         p.lower() for n in names if not SENTENCE.fullmatch(n) for p in re.findall('[A-Z]+(?![a-z])|[A-Z]?[a-z]+', n)
     )
     # Beside what is right, left is a side.
-    sides = {'left'} if 'right' in names else set()
-    return Counter(p for p in parts if p in FINISHED) + Counter(n for n in names if n in EXACT.keys() - sides)
+    exact = EXACT.keys() - ({'left'} if 'right' in names else set())
+    return Counter(p for p in parts if p in FINISHED) + Counter(n for n in names if n in exact)
 
 
 if __name__ == '__main__':
