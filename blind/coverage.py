@@ -42,7 +42,7 @@ IN_STEP = {'14 to 19': range(14, 20), '12 to 19': range(12, 20), '0 to 7': range
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One rig: rms noise of each channel V, AR(1) memory, hum V at ``mains`` Hz, converter, offsets of x1, y1, x2, y2 V.
+    """One rig: rms noise of all channels V, AR(1) memory, hum V at ``mains`` Hz, bits, offsets of x1, y1, x2, y2 V.
     ``stated``: the rig file has that noise. ``corner``: Hz, where 1/f noise is as much as the white."""
 
     label: str
