@@ -14,7 +14,16 @@ from psd_deflection.measure.estimation import HELD, ZERO_VARIANCES
 from psd_deflection.measure.health import FROZEN, LOUD
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.state import load_states
-from psd_deflection.measure.uncertainty.block_estimator import DRIFT, HUM, MOVES, NOISE, PSDS, STEPS, VIBRATION
+from psd_deflection.measure.uncertainty.block_estimator import (
+    CANDIDATES,
+    DRIFT,
+    HUM,
+    MOVES,
+    NOISE,
+    PSDS,
+    STEPS,
+    VIBRATION,
+)
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.model.simulation.tip_load import TIP_LOADS
 from psd_deflection.recordings.read.readers import open_recording
@@ -123,6 +132,10 @@ def humming(volts: FloatArray) -> None:
     volts += 0.01 * np.sin(2.0 * np.pi * 0.06 * np.arange(len(volts)))[:, None] * (1.0, 0.8, 1.0, 0.9, 1.1, 1.0)
 
 
+def faint(volts: FloatArray) -> None:
+    volts[:, 1::3] += 7e-4 * np.sin(2.0 * np.pi * 0.187 * np.arange(len(volts)))[:, None]
+
+
 def drifting(volts: FloatArray) -> None:
     volts[:] = volts[np.arange(7000) % 2900]
     volts[:, 0] += 2e-6 * np.arange(7000)
@@ -169,6 +182,7 @@ CASES = {
     'hums': Case(HUM, (99, 171), humming),
     'drifts': Case(DRIFT, (130, 271), drifting),
     'moves': Case(MOVES, (151,)),
+    'may vibrate': Case(CANDIDATES, (60,), faint),
     'ten bits': Case(STEPS, (160,), coarse),
     'PSD 2 dark': Case(HELD, (212, 260), dark, {'degraded': 'hold'}),
     'PSD 1 stands still': Case(FROZEN, (178,), stuck, {'frozen': 'reject'}),

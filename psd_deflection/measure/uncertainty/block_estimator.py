@@ -159,15 +159,20 @@ def _common(a: float, b: float, within: float) -> float:
 
 
 NOISE, SEGMENT, SUMS = 'state.noise', 'state.noise_segment', 'state.sums_segment'
-VIBRATION, HUM, DRIFT, MOVES, STEPS, PSDS = (
+VIBRATION, HUM, DRIFT, MOVES, CANDIDATES, STEPS, PSDS = (
     'state.vibration',
     'state.hum',
     'state.drift',
     'state.moves',
+    'state.candidates',
     'state.converter_steps',
     'state.psds.',
 )
 """Names of the state; ``PSDS`` goes on with the PSDs (from 0) of a set, such as "state.psds.0_1"."""
+
+
+_LONG = 64
+"""Samples of a block for each of which "moves" is reported one block longer."""
 
 
 class BlockEstimator:
@@ -180,7 +185,7 @@ class BlockEstimator:
     """
 
     part = 'the fit and the noise of the dots'
-    prefixes = (NOISE, SUMS, VIBRATION, HUM, DRIFT, MOVES, STEPS, PSDS)
+    prefixes = (NOISE, SUMS, VIBRATION, HUM, DRIFT, MOVES, CANDIDATES, STEPS, PSDS)
 
     def __init__(self, rig: Rig, on_plate: bool = True, tilts: Tilts = 'none') -> None:
         """``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs."""
@@ -205,7 +210,7 @@ class BlockEstimator:
         self.chi_square = 0.0
         self.poor_fits = 0
         self.vibrating: tuple[Tone, ...] = ()
-        self._disturbed = self._moves = self._poor_fit = False
+        self._disturbed, self._moves = False, 0
         self._use_noise()
 
     def _model(self) -> tuple[FloatArray | None, Residual | None]:
@@ -238,8 +243,8 @@ class BlockEstimator:
         self.excluded, self.vibrating, self._disturbed = excluded, (), fitted is not None
         if fitted is not None:
             self.poor_fits += fitted.poor_fit
-            # A block of many samples hides the end of a motion that the one before it showed.
-            self._moves, self._poor_fit = fitted.poor_fit or self._poor_fit, fitted.poor_fit
+            # Blocks of many samples hide the end of a motion that one before them showed.
+            self._moves = 2 + self._size // _LONG if fitted.poor_fit else max(self._moves - 1, 0)
             self.vibrating = tuple(self.noise.tones[i] for i in fitted.vibrating)
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
@@ -363,7 +368,7 @@ class BlockEstimator:
 
     def state_dict(self) -> State:
         """See :class:`psd_deflection.measure.state.Part`."""
-        out: State = {MOVES: (1.0,)} if self._poor_fit else {}
+        out: State = {MOVES: (float(self._moves),)} if self._moves else {}
         if self.on_plate:
             tones = tuple(v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist()))
             hum = tuple(v for h in self.noise.hum for v in (h.frequency, *h.cosine.tolist(), *h.sine.tolist()))
@@ -371,6 +376,7 @@ class BlockEstimator:
             rows |= {
                 SUMS: self.noise.sums(),
                 DRIFT: self.noise.drift.state(),
+                CANDIDATES: self.noise.candidates,
                 STEPS: self._converter.state(),
             }
             out |= {name: row for name, row in rows.items() if row}
@@ -383,13 +389,14 @@ class BlockEstimator:
         if steps := numbers(values, STEPS, 'the steps of these channels'):
             self._converter.set_state(steps)
             self._use_steps()
-        self._poor_fit = MOVES in values
+        self._moves = int((numbers(values, MOVES, 'blocks', 1) or (0.0,))[0])
         if noise := numbers(values, NOISE, 'the noise of this rig'):
             self.noise.hum = _hum(numbers(values, HUM, 'the hum') or (), 2 * len(self._rig.psds))
             self.noise.set_state(noise)
             sums = numbers(values, SUMS, 'sum signals of a segment') or ()
             self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or (), sums)
             self.noise.tones = _tones(numbers(values, VIBRATION, 'what vibrates') or (), 2 * len(self._rig.psds))
+            self.noise.candidates = numbers(values, CANDIDATES, 'frequencies') or ()
             if drift := numbers(values, DRIFT, 'the drift of these readings'):
                 self.noise.drift.set_state(drift)
             self._use_noise()

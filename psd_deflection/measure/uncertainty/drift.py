@@ -11,11 +11,11 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.records import FloatArray
 
-_SHORTEST, _LONGEST = 5, 20
-"""Segments of a fit: 5 to 20 s with blocks of 20 at 1 kHz."""
+_SHORTEST, _LONGEST = 4, 20
+"""Segments of a fit: 4 to 20 s with blocks of 20 at 1 kHz."""
 
-_SIGNIFICANT = 6.0
-"""Standard deviations of a slope: of white noise, chance makes one of four readings seem to drift once in 4 years."""
+_SIGNIFICANT = 5.0
+"""Standard deviations of a slope: of white noise, chance makes one of four readings seem to drift once in 5 days."""
 
 
 class Drift:

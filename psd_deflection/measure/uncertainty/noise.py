@@ -119,6 +119,7 @@ class StreamNoise:
         self._signals = 0
         self._search: ToneSearch | None = None
         self.tones: tuple[Tone, ...] = ()
+        self.candidates: tuple[float, ...] = ()
         self.hum: tuple[Hum, ...] = ()
         self.drift = Drift(count, xp)
         self._average: FloatArray | None = None
@@ -316,8 +317,8 @@ class StreamNoise:
         """Look for tones of a segment; return its ``dots`` (n, C), m, without those of the electronics."""
         still = np.column_stack((self._combinations.fixed(dots), sums))
         known = [*(tone.frequency for tone in self.tones), *(hum.frequency for hum in self.hum)]
-        tones = search.tones(places, dots, still, self._moving, known)
-        self.tones, self.hum = tones.moving, ()
+        tones = search.tones(places, dots, still, self._moving, known, self.candidates)
+        self.tones, self.candidates, self.hum = tones.moving, tones.candidates, ()
         for frequency in tones.hum:
             dots, hum = search.without(places, dots, frequency)
             self.hum += (hum,)

@@ -37,6 +37,10 @@ SIGNIFICANT = 28.0
 _OBSERVED = 12.0
 """Times the floor: a combination, or a sum signal, takes part in a tone that is there."""
 
+_CANDIDATE = 16.0
+"""Times the floor: a peak that is a tone if the next segment has it too, one bin off at most. Chance does it once in
+ten years."""
+
 _ELECTRIC = 0.01
 """Share of a tone's variance in what cannot move, from which it is hum and no motion."""
 
@@ -88,10 +92,12 @@ class Hum(NamedTuple):
 
 
 class Tones(NamedTuple):
-    """What a segment has: ``moving`` of the link, and the frequencies, cycles a sample, of ``hum``."""
+    """What a segment has: ``moving`` of the link, and the frequencies, cycles a sample, of ``hum`` and ``candidates``:
+    peaks that the next segment may confirm."""
 
     moving: tuple[Tone, ...] = ()
     hum: tuple[float, ...] = ()
+    candidates: tuple[float, ...] = ()
 
 
 class ToneSearch:
@@ -123,12 +129,13 @@ class ToneSearch:
         still: FloatArray,
         combinations: FloatArray,
         known: Sequence[float] = (),
+        candidates: Sequence[float] = (),
     ) -> Tones:
         """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its limit first.
 
         ``dots`` (n, C), m: the readings, ``combinations`` (a, C): rows of their combinations that move with the link.
         ``still`` (n, b), m: what cannot move. ``known``: frequencies of the segment before, cycles a sample: those may
-        be weaker.
+        be weaker. ``candidates``: of the segment before.
         """
         if self._last - self._first < _GROUP or len(places) < 2:
             return Tones()
@@ -144,6 +151,8 @@ class ToneSearch:
         free = np.zeros(len(power), dtype=bool)
         free[self._first : self._last + 1] = True
         limit = np.full(len(power), SIGNIFICANT)
+        for at in (round(frequency * self._length) for frequency in candidates):
+            limit[max(at - 1, 0) : at + 2] = _CANDIDATE
         for at in (round(frequency * self._length) for frequency in known):
             limit[max(at - _NARROW, 0) : at + _NARROW + 1] = _OBSERVED
         peaks = above[:, :count].max(axis=1) / limit
@@ -171,6 +180,9 @@ class ToneSearch:
                 continue
             covariance = scale * self._cross_spectrum(spectrum[None, band, :count] * observed[:count])[0]
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', combinations, covariance, combinations)))
+        peaks = np.where(free, above[:, :count].max(axis=1), 0.0)
+        strongest = np.argsort(-peaks, kind='stable')[:_MOST]
+        maybe = tuple((strongest[peaks[strongest] >= _CANDIDATE] / self._length).tolist())
         # What the tones have is theirs already.
         for band in self._broad(every * free[:, None], readings, known):
             # The quietest group has the noise alone, or hardly more.
@@ -182,7 +194,7 @@ class ToneSearch:
             covariance = signal[:, None] * covariance * signal
             frequency = 0.5 * (band.start + band.stop - 1) / self._length
             out.append(Tone(frequency, self._xp.einsum('ac,ab,bd->cd', combinations, scale * covariance, combinations)))
-        return Tones(tuple(out), tuple(hum))
+        return Tones(tuple(out), tuple(hum), maybe)
 
     def _grouped(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """``values`` (F, k) as (groups, bins, k)."""
