@@ -87,7 +87,7 @@ def test_the_command_says_which_rule_is_broken(capsys: pytest.CaptureFixture[str
     assert 'laser 1 out: one of the two lasers is out' in out
     assert main([*words, '--allowed', '0.9e-3', '--json']) == 1
     tree = json.loads(capsys.readouterr().out)
-    assert [rule['words'] for rule in tree['rules'] if not rule['kept']] == ['both together']
+    assert [rule['words'] for rule in tree['rules'] if not rule['satisfied']] == ['both together']
     assert tree['phases'][3]['status'] == 'LASER_LOST'
 
 
