@@ -15,7 +15,8 @@ _SHORTEST, _LONGEST = 4, 20
 """Segments of a fit: 4 to 20 s with blocks of 20 at 1 kHz."""
 
 _SIGNIFICANT = 5.0
-"""Standard deviations of a slope: of white noise, chance makes one of four readings seem to drift once in 5 days."""
+"""Standard deviations of a slope, or of all together: of white noise, chance makes one of four readings seem to drift
+once in 5 days."""
 
 
 class Drift:
@@ -26,6 +27,10 @@ class Drift:
         self._xp = xp
         self._means: list[FloatArray] = []  # Bound: _LONGEST.
         self.slope = np.zeros(count)
+        # A chi-square of all slopes together (Wilson & Hilferty 1931).
+        share = 2.0 / (9.0 * count)
+        cube_root = 1.0 - share + _SIGNIFICANT * xp.root(share)
+        self._limit = count * cube_root * cube_root * cube_root
 
     def interrupt(self) -> None:
         """Begin anew after a segment that is missing, or in which the link moved."""
@@ -44,7 +49,9 @@ class Drift:
         slope = xp.sum(time[:, None] * means, 0) / squares
         residual = means - time[:, None] * slope
         variance = np.maximum(sd * sd, xp.sum(residual * residual, 0) / (count - 2)) / squares
-        self.slope = np.where(slope * slope > _SIGNIFICANT * _SIGNIFICANT * variance, slope, 0.0)
+        ratio = slope * slope / variance
+        together = float(xp.sum(ratio, 0)) > self._limit
+        self.slope = slope if together else np.where(ratio > _SIGNIFICANT * _SIGNIFICANT, slope, 0.0)
 
     def state(self) -> tuple[float, ...]:
         """Return the state as numbers; () before the first segment at rest."""
