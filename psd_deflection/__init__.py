@@ -432,12 +432,12 @@ def discover_in(
     ``plant``: a :class:`psd_deflection.studies.discover.plants.Plant`, which has measured tables, a simulation and a
     library of effects that may be missing; or a CSV table, whose ``outputs`` are sums of terms of its ``inputs``, both
     names of columns (``parts``, ``kinds``, ``noise``: see
-    :class:`psd_deflection.studies.discover.csv_plant.CsvPlant`). Search, rules and answer are those of
+    :class:`psd_deflection.studies.discover.plant_csv.CsvPlant`). Search, rules and answer are those of
     :func:`discover`; ``save(folder)`` writes ``result.json`` and a page, ``predict`` takes another plant or table. The
     same ``seed`` gives the same answer. Raises :class:`psd_deflection.base.errors.ConfigError` if the plant contradicts
     itself.
     """
-    from psd_deflection.studies.discover.csv_plant import CsvPlant
+    from psd_deflection.studies.discover.plant_csv import CsvPlant
     from psd_deflection.studies.discover.plant_search import discover_in as of_plant
     from psd_deflection.studies.discover.plants import Plant
 

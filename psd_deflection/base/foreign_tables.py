@@ -134,7 +134,8 @@ def what_of_text(text: str) -> Layout:
     if units:
         words += ', a row of units below the header' if units == 1 else f', {units} rows of words below the header'
         stages.append('sed 2d' if units == 1 else f'sed 2,{1 + units}d')
-    commas = bool(_DECIMAL_COMMA.search('\n'.join(lines[begin:])))
+    # Between commas a cell with a decimal comma is quoted.
+    commas = any('"' in m[0] or separator != ',' for m in _DECIMAL_COMMA.finditer('\n'.join(lines[begin:])))
     if separator == ' ':
         stages += ["tr ',' '.'"] * commas + ["awk -v OFS=, '{$1 = $1} 1'"]
     elif separator != ',':

@@ -50,6 +50,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from psd_deflection import discover_in
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.text import plain_number
 from psd_deflection.cli._many import FLEET, absolute, each_for_itself, each_option
@@ -75,13 +76,11 @@ from psd_deflection.recordings.write.parquet import ERROR, Field
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.conclusion import adopting_folder
-from psd_deflection.studies.discover.csv_plant import CsvPlant
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LISTED, SCRIPT, LoopResult, planned, recorded_name, run_loop
 from psd_deflection.studies.discover.planning import Plan
-from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 
@@ -312,8 +311,8 @@ def _in_csv(args: argparse.Namespace) -> int:
     reject(args, {'adopt': None, 'each': False, 'next': False, 'params_file': None}, 'is for recordings of the rig')
     make_writable(args.out)
     with stage('searching', quiet=args.quiet or args.json):
-        plant = CsvPlant(args.recordings[0], args.inputs.split(','), args.outputs.split(','), args.parts)
-        discovery = discover_in(plant, seed=args.seed)
+        columns = {'inputs': args.inputs.split(','), 'outputs': args.outputs.split(',')}
+        discovery = discover_in(args.recordings[0], **columns, parts=args.parts, seed=args.seed)
     return _answered(args, discovery, discovery.files(), [])
 
 

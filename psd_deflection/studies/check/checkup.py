@@ -225,8 +225,8 @@ def check(problem: CheckProblem) -> Checkup:
     determined = not dead and len(wirings) == 1
     if not determined and not dead:
         findings += _coverage(pushes, observed, wirings)
-    # Pushes that are not there yet are no mistake.
-    wrong = light or problem.late or problem.notes or any(f.name != 'load_coverage' for f in findings)
+    # Pushes that are not there yet are no mistake, nor are times as people note them.
+    wrong = light or problem.late or any(f.name != 'load_coverage' and not f.by_hand for f in findings)
     verdict = WRONG if wrong else RIGHT if determined else CANNOT_TELL
     sizes = tuple(p.match(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(

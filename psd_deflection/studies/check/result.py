@@ -159,6 +159,8 @@ NAMES = {
     'load_coverage': 'not seen',
 }
 """All names that a finding may have, as other programs know them, in words."""
+BY_HAND_S = 0.1
+"""s by which a load that is noted by hand may be late or early without being a mistake."""
 WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 
 
@@ -183,6 +185,12 @@ class Finding:
     def __post_init__(self) -> None:
         if self.name not in NAMES:
             raise ValueError(f'{self.name}: must be one of {", ".join(NAMES)}')
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether it is a time as any load noted by hand has, and no mistake."""
+        late = isinstance(self.value, float) and abs(self.value) < BY_HAND_S
+        return late and self.name in ('load_time', 'load_delay')
 
 
 def finding_tree(finding: Finding) -> dict[str, Any]:

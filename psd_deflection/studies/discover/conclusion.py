@@ -407,7 +407,7 @@ def _setup(discovery: RigConclusion) -> str:
     where: dict[str, dict[str, None]] = {}
     alternatives: dict[str, dict[str, None]] = {}
     for f in discovery.setup:
-        if f.name in ('load_time', 'load_delay') and isinstance(f.value, float) and abs(f.value) < BY_HAND_S:
+        if f.by_hand:
             continue
         name = f.name.replace('_', ' ')
         place = ', '.join(filter(None, (_place(f), _seconds(f))))
@@ -452,8 +452,6 @@ def _seconds(finding: Finding) -> str:
     return f'{abs(finding.value):.3g} s{direction}'
 
 
-BY_HAND_S = 0.1
-"""Nobody notes a load better by hand: such a time is corrected without a word in the answer's sentence."""
 STATIC = ('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance')
 """Effects that change how far a load moves the link at rest; stiffnesses with ``moves_frequency`` its ringing, too."""
 LEAST_FACTOR = 1e-3

@@ -61,24 +61,32 @@ class CsvPlant(Plant):
         cell may be empty.
         """
         table = CsvTable(Path(path))
-        table.require((*inputs, *outputs, *((parts,) if parts else ())), 'a table of inputs and outputs')
+        # Of a table that is predicted, the inputs are enough.
+        fitted = middles is None
+        table.require(
+            (*inputs, *((*outputs, *filter(None, [parts])) if fitted else ())), 'a table of inputs and outputs'
+        )
         rows = list(table.table_rows())
-        if not inputs or not outputs or len(rows) < FOLDS:
+        if not inputs or not outputs or len(rows) < (FOLDS if fitted else 1):
             raise ConfigError(f'{path}: {len(rows)} rows: needs inputs, outputs and at least {FOLDS} rows')
         self.channels, self.noise = tuple(map(_bare, outputs)), tuple(noise)
         self.units = tuple(_unit(name) for name in outputs)
         self._arguments = (tuple(inputs), tuple(outputs), parts, dict(kinds or {}), tuple(noise))
         self._inputs = {_bare(name): np.array([row.number(name) for row in rows]) for name in inputs}
-        self._outputs = np.array([[row.number(n) if row.text(n) else math.nan for row in rows] for n in outputs])
-        texts = (
-            [row.text(parts) for row in rows] if parts else list(map(str, np.arange(len(rows)) * FOLDS // len(rows)))
-        )
+        there = [name if name in table.columns else '' for name in outputs]
+        self._outputs = np.array([[row.number(n) if n and row.text(n) else math.nan for row in rows] for n in there])
+        texts = [str(i * FOLDS // len(rows)) for i in range(len(rows))]
+        if parts and fitted:
+            texts = [row.text(parts) for row in rows]
         order = list(dict.fromkeys(texts))
         self._parts: IntArray = np.array([order.index(text) for text in texts])
+        self._fitted = fitted
         self._middles = dict(middles or {name: _middle(u) for name, u in self._inputs.items()})
         self._units = {_bare(n): _unit(n) for n in inputs}
         self._terms = self._terms_of({_bare(n): (kinds or {}).get(n) or _kind(n) for n in inputs})
-        sd = np.nanstd(self._outputs, axis=1) + 1e-300
+        sd = (
+            np.array([row[np.isfinite(row)].std() if np.isfinite(row).any() else 1.0 for row in self._outputs]) + 1e-300
+        )
         effects: dict[str, EffectParameter] = {}
         for output, unit, of_output in zip(self.channels, self.units, sd.tolist(), strict=True):
             for name, term in {'offset': _Term(np.ones(1), ''), **self._terms}.items():
@@ -120,7 +128,7 @@ class CsvPlant(Plant):
             u, middle, unit = self._inputs[name], self._middles[name], self._units[name]
             if kind not in KINDS:
                 raise ConfigError(f'kinds: {name} = {kind!r}: must be one of {", ".join(KINDS)}')
-            if np.ptp(u) == 0.0:
+            if self._fitted and np.ptp(u) == 0.0:
                 continue  # A constant is in the offset.
             if kind in ('degrees', 'radians'):
                 angle = np.radians(u) if kind == 'degrees' else u
