@@ -201,8 +201,9 @@ ROWS = table().splitlines()
             ('it has t [s],x_cal [au]', 't for t'),
         ),
         (b'0.0,1,2,3,4,5,6\n0.1,1,2,3,4,5,6\n', (':1: the header lacks t', 'it has 0.0,1,2')),
+        (b'a,b\n1,2\n3,4\n5,6\n', ('the header lacks t, x1', 'it has a,b')),
     ],
-    ids=['split', 'midfile', 'iso', 'german_date', 'stray', 'thorlabs', 'no_header'],
+    ids=['split', 'midfile', 'iso', 'german_date', 'stray', 'thorlabs', 'no_header', 'whole_numbers'],
 )
 def test_what_no_line_converts_is_named_by_row(tmp_path: Path, content: bytes, words: tuple[str, ...]) -> None:
     path = tmp_path / 'a.csv'

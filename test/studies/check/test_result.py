@@ -185,6 +185,11 @@ def test_levels_are_in_mv_and_drift_in_um_per_minute() -> None:
         assert (level_rows(short)[3][1] != 'cannot be determined: the recording is too short') is known
 
 
+def test_a_load_noted_within_a_tenth_of_a_second_is_no_mistake() -> None:
+    late = [replace(finding('load_time', 'load 2'), value=value) for value in (-0.099, 0.1, (1.0, 0.0, 0.0))]
+    assert [f.by_hand for f in (*late, replace(finding('sensitivity', 'psd 1'), value=0.05))] == [True, *[False] * 3]
+
+
 def test_the_tree_and_the_table_have_all_numbers() -> None:
     wrong = replace(CHECKUP, verdict=WRONG, findings=(finding('channel_sign', 'x1', 'turn', ('a',)),), source='run.csv')
     assert wrong.sources == {'recording': 'run.csv'}
