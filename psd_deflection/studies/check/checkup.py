@@ -212,7 +212,8 @@ def check(problem: CheckProblem) -> Checkup:
     observed = tuple(p for p in pushes if p.observed)
     dead = [*measured.stuck, *(c for c in _dead(observed) if c not in measured.stuck)]
     wirings = fitting_wirings(observed) if observed else []
-    findings = [note_finding(n, problem.source) for n in problem.notes]
+    notes = [note_finding(n, problem.source) for n in problem.notes]
+    findings = list(notes)
     lines: dict[str, object] = {}
     for channel in dead:
         findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))
@@ -226,7 +227,7 @@ def check(problem: CheckProblem) -> Checkup:
     if not determined and not dead:
         findings += _coverage(pushes, observed, wirings)
     # Pushes that are not there yet are no mistake, nor are times as people note them.
-    wrong = light or problem.late or any(f.name != 'load_coverage' and not f.by_hand for f in findings)
+    wrong = light or problem.late or any((f in notes or f.name != 'load_coverage') and not f.by_hand for f in findings)
     verdict = WRONG if wrong else RIGHT if determined else CANNOT_TELL
     sizes = tuple(p.match(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(
