@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from blind.campaign import options
-from blind.machines import PHYSICAL, AuxTel, Boom, Emps
+from blind.machines import PHYSICAL, AuxTel, Boom, Emps, TwoLinkArm
 from psd_deflection.model.simulation.declaration import Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
@@ -24,7 +24,6 @@ DATA = Path(os.environ.get('PSD_FOREIGN_DATA', 'PSD_FOREIGN_DATA is not set'))
 GROUPS = 11  # Folds into which the parts of a plant are dealt in turn, at most.
 THRESHOLDS = np.geomspace(1e-2, 1.0, 25)  # Of STLSQ, in units of the largest contribution of a term.
 RIDGE = 1e-4  # Of STLSQ, in units of the mean square of a term.
-EMPS_S, EMPS_START = 24.84, 2  # s of a record, simulated in one piece; readings at its start that do not count.
 FRICTION = ('coulomb_friction', 'force_offset')
 BoolArray = npt.NDArray[np.bool_]
 Residual = Callable[[Sequence[Effect], BoolArray], FloatArray]
@@ -161,32 +160,19 @@ def nested(make: Callable[[], Plant], is_linear: bool) -> Iterator[tuple[str, fl
         yield name, rms(rest[np.isfinite(rest)])
 
 
-def model_of(discovery: PlantDiscovery) -> Model:
-    every = (*(e.active for e in discovery.effects), *(a for a, _ in discovery.nuisance))
-    return {a.effect.name: dict(a.values) for a in every}
-
-
-def of_emps(data: Path, discovered: Model) -> Iterator[tuple[str, float]]:
-    """Its test record in one piece without feedback: with what was found, and with the published terms."""
-    for words, without, model in (('found', FRICTION, discovered), ('published', (), {})):
-        plant = Emps(without, data / 'emps', record='DATA_EMPS_PULSES.mat', segment=EMPS_S)
-        (measured,), (simulated,) = plant.measured(), plant.simulate(model)
-        yield f'test record, terms as {words}, rms; m', rms((measured - simulated)[0, EMPS_START:])
-
-
 class Duel(NamedTuple):
     """``make``: the machine, of the folder of the data; ``known``: the same with what is published in its model.
-    ``is_linear``: in all terms. ``test``: figures on data that no search has."""
+    ``is_linear``: in all terms."""
 
     make: Callable[[Path], Plant]
     known: Callable[[Path], Plant]
     is_linear: bool = False
-    test: Callable[[Path, Model], Iterator[tuple[str, float]]] | None = None
 
 
 DUELS: Mapping[str, Duel] = {
     'auxtel': Duel(lambda d: AuxTel(d / 'auxtel.txt'), lambda d: AuxTel(d / 'auxtel.txt', known=PHYSICAL[:4]), True),
-    'emps': Duel(lambda d: Emps(FRICTION, d / 'emps'), known=lambda d: Emps((), d / 'emps'), test=of_emps),
+    'emps': Duel(lambda d: Emps(FRICTION, d / 'emps'), lambda d: Emps((), d / 'emps')),
+    'arm': Duel(lambda d: TwoLinkArm(d / 'two_link_arm'), lambda d: TwoLinkArm(d / 'two_link_arm')),
     'boom': Duel(lambda d: Boom(d / 'boom'), known=lambda d: Boom(d / 'boom', weighed=True)),
 }
 
@@ -218,9 +204,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             if args.out is not None:
                 discovery.save(args.out / name)
             status = 0
-            if not args.null and duel.test is not None:
-                for measure, figure in duel.test(args.data, model_of(discovery)):
-                    print(f'| {name} | {measure} | discover_in | {figure:.3g} |', flush=True)
             if not args.null and not args.named:
                 unit = make(args.data).units[0]
                 for way, figure in nested(lambda make=make: make(args.data), duel.is_linear):  # type: ignore[misc]

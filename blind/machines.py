@@ -1,13 +1,12 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Machines that others measured, as plants for ``discover_in``: a linear drive, a telescope's pointing, a boom."""
+"""Machines that others measured, as plants for ``discover_in``: a linear drive, a flexible arm, a telescope, a boom."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray, IntArray
@@ -50,14 +49,6 @@ LIBRARY = (
 )
 
 
-def _read(path: Path) -> FloatArray:
-    """(n, 3): time (s), position (m), voltage (V)."""
-    if path.suffix == '.mat':
-        tables = loadmat(path)
-        return np.column_stack([np.asarray(tables[name], dtype=np.float64)[:, 0] for name in ('t', 'qm', 'vir')])
-    return _table(path)
-
-
 class Emps(Plant):
     """``without``: published terms that the model lacks, ``coulomb_friction`` or ``force_offset``."""
 
@@ -66,13 +57,10 @@ class Emps(Plant):
     library: tuple[Effect, ...] = LIBRARY
     period = KEPT / RATE
 
-    def __init__(
-        self, without: Sequence[str], folder: Path, record: str = 'emps.csv', segment: float = SEGMENT_S
-    ) -> None:
-        """``record``: a file, ``.csv`` or the benchmark's ``.mat``; ``segment``: s after which the simulation starts
-        again. Raises OSError if ``folder`` has no such file."""
-        rows = _read(folder / record)
-        n = round(segment * RATE)
+    def __init__(self, without: Sequence[str], folder: Path) -> None:
+        """Raises OSError if ``folder`` has no ``emps.csv``."""
+        rows = _table(folder / 'emps.csv')
+        n = round(SEGMENT_S * RATE)
         count = len(rows) // n
         position = rows[: count * n, 1].reshape(count, n)
         self._voltage = rows[: count * n, 2].reshape(count, n)
@@ -84,7 +72,7 @@ class Emps(Plant):
             speed[i] = np.polyfit(np.arange(-reach, reach + 1) / RATE, around, 4)[3]
         self._start = np.stack([position[:, 0], speed])
         self._measured = [row[None, ::KEPT] for row in position]
-        self.cases = tuple(f'{segment * i:.0f} s' for i in range(count))
+        self.cases = tuple(f'{SEGMENT_S * i:.0f} s' for i in range(count))
         self._terms = (0.0 if 'coulomb_friction' in without else COULOMB, 0.0 if 'force_offset' in without else OFFSET)
 
     def measured(self) -> list[FloatArray]:
@@ -274,3 +262,81 @@ class Boom(Plant):
 
         start = tip(self.lengths[:1], np.zeros(1))
         return [(tip(r[:, 0], r[:, 1]) - start)[None, :] for r in self._rows]
+
+
+GEAR = 0.75 * 0.119 * 100.0  # N m/A at the load shaft: efficiency, torque constant, ratio.
+HUB, TIP, HUB_VISCOUS = 6.28e-6 * 100.0**2 + 7.3616e-4, 0.18028257 - 1.578 * 0.079**2, 4.0  # kg m^2 twice; N m s/rad
+BEAM = 2.068427e11 * 0.0762 * 0.00127**3 / (4.0 * 0.202)  # N m/rad
+READ_S, ARM_STEPS, ARM_PIECE = 0.01, 2, 50  # s between readings; steps between two; readings simulated in one piece.
+ARM_SCALES = ('hub_viscous', 'stiffness', 'torque_gain', 'hub_inertia', 'tip_inertia', 'tip_gain')
+ARM = (
+    plant_effect('coulomb_friction', EffectParameter('torque', 'N m', 0.0, 20.0, 0.3, 'at the hub')),
+    plant_effect('tip_damping', EffectParameter('damping', 'N m s/rad', 0.0, 5.0, 0.02, 'in the beam')),
+    plant_effect('current_offset', EffectParameter('current', 'A', -1.0, 1.0, 0.01, 'always the same way')),
+    plant_effect('input_delay', EffectParameter('delay', 's', 0.0, 0.05, 0.002, 'of the current')),
+    plant_effect('tip_offset', EffectParameter('angle', 'rad', -0.05, 0.05, 5e-4, 'of the reading')),
+    *(_scale(name, 'relative change') for name in ARM_SCALES),
+)
+
+
+class TwoLinkArm(Plant):
+    """Stage 1 of a flexible arm under its controller. Its maker's model lacks Coulomb friction and damping of the tip."""
+
+    channels = ('hub', 'tip')
+    units = ('rad', 'rad')
+    library: tuple[Effect, ...] = ARM
+    period = READ_S
+
+    def __init__(self, folder: Path) -> None:
+        """Raises OSError if ``folder`` has no ``excerpt.csv``."""
+        rows = np.genfromtxt(folder / 'excerpt.csv', delimiter=',', skip_header=1, dtype=str)
+        runs = tuple(dict.fromkeys(rows[:, 0].tolist()))
+        values = np.where(rows[:, 1:] == '', 'nan', rows[:, 1:]).astype(np.float64)
+        tables = [values[rows[:, 0] == run] for run in runs]
+        n, starts = ARM_PIECE, list[FloatArray]()
+        pieces = [t[i : i + n] for t in tables for i in range(0, len(t) - n + 1, n)]
+        for t in tables:
+            starts.append(t[0, 2:6])
+            # Angles and rates from cubics through 80 ms on either side.
+            for i in range(n, len(t) - n + 1, n):
+                cubic = np.polyfit(np.arange(-8, 9) * READ_S, t[i - 8 : i + 9, 2:4], 3)
+                starts.append(np.concatenate((cubic[3], cubic[2])))
+        self._current, hub, tip = (np.array([t[:, i] for t in pieces]) for i in (1, 2, 3))
+        self.cases = tuple(f'{run} {k}' for run, t in zip(runs, tables, strict=True) for k in range(len(t) // n))
+        self._measured = [np.stack(pair) for pair in zip(hub, tip, strict=True)]
+        self._start = np.array(starts).T
+
+    def measured(self) -> list[FloatArray]:
+        """Angle of the hub and of the tip against it, rad."""
+        return self._measured
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        """Current, A."""
+        return {'current': list(self._current)}
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        """Return all segments at once, semi-implicit Euler; viscous friction of the hub is exact over a step."""
+        scale = {name: 1.0 + _of(model, name, 'scale') for name in ARM_SCALES}
+        hub, tip, spring = HUB * scale['hub_inertia'], TIP * scale['tip_inertia'], BEAM * scale['stiffness']
+        viscous, damping = HUB_VISCOUS * scale['hub_viscous'], _of(model, 'tip_damping', 'damping')
+        coulomb = _of(model, 'coulomb_friction', 'torque')
+        h = READ_S / ARM_STEPS
+        at = np.clip(np.arange(self._current.shape[1]) - _of(model, 'input_delay', 'delay') / READ_S, 0.0, None)
+        low = np.minimum(at.astype(np.int64), len(at) - 2)
+        current = self._current[:, low] + (at - low) * (self._current[:, low + 1] - self._current[:, low])
+        torque = GEAR * scale['torque_gain'] * (current.T + _of(model, 'current_offset', 'current'))
+        fade = np.exp(-h * viscous / hub)
+        gain = (1.0 - fade) / viscous
+        q, bent, v, w = self._start
+        w = w + v  # Of the tip, against the ground.
+        out = np.empty((len(torque), 2, len(q)))
+        for i, given in enumerate(torque):
+            out[i] = q, bent
+            for _ in range(ARM_STEPS):
+                couple = spring * bent + damping * (w - v)
+                free = fade * v + gain * (given + couple)
+                v = np.sign(free) * np.maximum(np.abs(free) - gain * coulomb, 0.0)
+                w = w - h / tip * couple
+                q, bent = q + h * v, bent + h * (w - v)
+        offset = _of(model, 'tip_offset', 'angle')
+        return [np.stack((r[:, 0], scale['tip_gain'] * r[:, 1] + offset)) for r in np.moveaxis(out, 2, 0)]

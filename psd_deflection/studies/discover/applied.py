@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csc_array
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
@@ -84,7 +85,7 @@ def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDir
     none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
     changes = [effective([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
     return [
-        LoadDirection(recording, change, FREE_MOMENTS, note, axis, effective, none)
+        LoadDirection(recording, csc_array(change), FREE_MOMENTS, note, axis, effective, none)
         for axis, change in enumerate(changes)
     ]
 
@@ -93,10 +94,16 @@ def of_hold(o: Observation, recording: int, hold: Hold | MeasuredLoad, sd: Float
     """1 N or 1 N m more in ``hold``, known to ``sd`` (3,) N, N, N m; axes that are known exactly are left out."""
     out = []
     for axis in np.flatnonzero(sd > 0.0).tolist():
-        more = np.zeros_like(o.loads)
-        more[hold.first : hold.last, axis] = 1.0
-        out.append(LoadDirection(recording, more, float(sd[axis]), hold, axis))
+        change = _at(o, slice(hold.first, hold.last), axis)
+        out.append(LoadDirection(recording, change, float(sd[axis]), hold, axis))
     return out
+
+
+def _at(o: Observation, samples: slice, axis: int) -> csc_array:
+    """Return loads (n, 3) of 1 N or 1 N m on one axis in the ``samples``."""
+    out = np.zeros_like(o.loads)
+    out[samples, axis] = 1.0
+    return csc_array(out)
 
 
 def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) -> list[LoadDirection]:
@@ -113,8 +120,7 @@ def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) 
         for axis, ((_, usual), (frequency, decay)) in enumerate(zip(stated, now, strict=True)):
             for before in (1, 1 + round(0.25 / (frequency * o.period))):
                 if decay < LONGER * usual and last - before >= first:
-                    change = np.zeros_like(o.loads)
-                    change[last - before, axis] = 1.0
+                    change = _at(o, slice(last - before, last - before + 1), axis)
                     out.append(LoadDirection(recording, change, PULSE, RINGING, axis, swings=True))
     return out
 

@@ -22,7 +22,7 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.shared_findings import noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.applied import directions, levels, ringing_on, times, unseen, wrong_load_findings
-from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, LoadDirection
+from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, Free, LoadDirection
 from psd_deflection.studies.discover.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded import Recorded
@@ -211,10 +211,11 @@ def _follows_nothing(problem: Problem) -> bool:
     return not columns or _residual_gap(ws, fit, columns) > max(FOLLOWS * gap, FREE_FROM * ws.floor())
 
 
-def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
-    """Return the gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
-    moved = np.column_stack(columns)
-    residual = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
+def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray], free: Free | None = None) -> float:
+    """Return the gap that ``columns`` (D,), whitened, and what is ``free`` leave of ``fit``, to first order."""
+    start, *beside = (v if free is None else free.beside(v) for v in (fit.residual, *columns))
+    moved = np.column_stack(beside)
+    residual = start - moved @ np.linalg.lstsq(moved, start, rcond=1e-9)[0]
     return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(residual - fit.residual), strict=True)])
 
 
@@ -230,20 +231,19 @@ def _rounded_beside_effect(problem: Problem) -> bool:
         if not may_be_rounded(asked):
             return False
         implied += [p for p in asked.holds if np.any(p.annotated != 0.0)]
-    alone = _residual_gap(ws, fit, _best_beside(problem, []))
-    # Nothing leaves less than the noise does; the signatures of all loads take much memory.
+    alone = _residual_gap(ws, fit, _best_beside(problem, None))
+    # Nothing leaves less than the noise does.
     if CLOSED * alone <= ws.floor():
         return False
     free = ws.with_free((*ws.directions, *directions(ws, implied))).free
-    loads = [] if free is None else [*free.rows]
-    beside = _residual_gap(ws, fit, [*loads, *_best_beside(problem, loads)])
+    beside = _residual_gap(ws, fit, _best_beside(problem, free), free)
     return beside < FOLLOWS * gap and beside < CLOSED * alone
 
 
-def _best_beside(problem: Problem, columns: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the signatures of the effect that explains most beside ``columns`` (D,), whitened."""
-    screen, known = problem.search.screen, np.column_stack(columns) if columns else None
-    return screen.columns_of(max(screen.score(problem.fit.residual, known), key=lambda s: s.gain).candidate)
+def _best_beside(problem: Problem, free: Free | None) -> list[FloatArray]:
+    """Return the signatures of the effect that explains most beside what is ``free``, whitened."""
+    screen = problem.search.screen
+    return screen.columns_of(max(screen.score(problem.fit.residual, free), key=lambda s: s.gain).candidate)
 
 
 def _rounded(problem: Problem) -> bool:

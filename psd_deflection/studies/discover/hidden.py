@@ -5,10 +5,12 @@ lines for the rig file, free loads, and how the link moved before the first samp
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csc_array, csr_array, vstack
 
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Stage, State, Values
 from psd_deflection.model.simulation.physics import Physics
@@ -16,6 +18,8 @@ from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray, dot_channels, dot_names
 
 AXES = ('dx', 'dy', 'theta')
+NEXT_TO_NOTHING = 1e-7
+"""Relative size of what a load does long after it changed, below which it is not stored."""
 
 
 def only_in(effects: Sequence[ActiveEffect], recording: int) -> list[ActiveEffect]:
@@ -187,15 +191,15 @@ SETUP = frozenset((*FIRST, 'zero', 'jump'))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadDirection:
-    """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, times a number of standard
-    deviation ``sd``.
+    """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, 0 in most samples, times a
+    number of standard deviation ``sd``.
 
     ``of``: what it belongs to; ``axis``: which of its numbers it is. ``exact``: the change (n, 3) by all of these
     numbers, if it is not in proportion; ``sizes``: the numbers that the loads have already.
     """
 
     recording: int
-    change: FloatArray
+    change: csc_array
     sd: float
     of: object
     axis: int
@@ -230,7 +234,7 @@ def added(more: Sequence[tuple[Direction, float]]) -> list[tuple[int, FloatArray
     for d, size in more:
         if isinstance(d, LoadDirection):
             if d.exact is None:
-                out.append((d.recording, size * d.change, d.swings))
+                out.append((d.recording, size * d.change.toarray(), d.swings))
             elif (now := sizes.pop(id(d.of), None)) is not None:
                 # The end of a ramp moves by its start and by its time: the two are no sum.
                 out.append((d.recording, d.exact(now) - d.exact(d.sizes), d.swings))
@@ -259,13 +263,35 @@ def _sizes(more: Sequence[tuple[Direction, float]]) -> dict[int, tuple[float, ..
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Free:
-    """``tables``: what each of the ``directions`` changes, V, at its standard deviation. ``rows`` (k, D): the whitened
-    span of these, orthonormal, of variance ``energy`` (k,) against that of the noise; ``back`` (p, k): from there to
-    the numbers.
+    """``tables`` (p, D): what each of the ``directions`` changes, V, at its standard deviation; ``white`` (p, D): the
+    same whitened. ``mix`` (p, k): orthonormal sums of these, of variance ``energy`` (k,) against that of the noise;
+    ``back`` (p, k): from there to the numbers.
     """
 
     directions: tuple[Direction, ...]
-    tables: tuple[list[FloatArray], ...]
-    rows: FloatArray
+    tables: csr_array
+    white: csr_array
+    mix: FloatArray
     energy: FloatArray
     back: FloatArray
+
+    def shares(self, white: npt.NDArray[np.floating]) -> FloatArray:
+        """Return the shares (k,) of the sums in a whitened vector (D,)."""
+        return np.asarray(self.mix.T @ (self.white @ white))
+
+    def sum(self, shares: FloatArray) -> FloatArray:
+        """Return the vector (D,) with these ``shares`` (k,) of the sums."""
+        return np.asarray((self.mix @ shares) @ self.white)
+
+    def beside(self, white: FloatArray) -> FloatArray:
+        """Return what the sums leave of a whitened vector (D,)."""
+        return white - self.sum(self.shares(white))
+
+
+def sparse_rows(vectors: Iterable[FloatArray]) -> csr_array:
+    """Return the ``vectors`` (D,) as rows, without values below ``NEXT_TO_NOTHING`` of the largest of each."""
+    rows = []
+    for v in vectors:
+        size = np.abs(v)
+        rows.append(csr_array(np.where(size > NEXT_TO_NOTHING * size.max(initial=0.0), v, 0.0)[None, :]))
+    return csr_array(vstack(rows))

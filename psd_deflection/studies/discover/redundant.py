@@ -12,6 +12,7 @@ from scipy.linalg import eigh
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.screen import Columns
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.plate_motion import across_of, dot_rows, moved_plate
 
@@ -115,9 +116,9 @@ def _moved(recording: int, count: int, shift: FloatArray) -> ActiveEffect:
     return ActiveEffect(effect, {'recording': recording + 1, 'share': 1.0})
 
 
-def visible(ws: Workspace, columns: Sequence[Sequence[FloatArray]]) -> float:
+def visible(ws: Workspace, columns: Columns) -> float:
     """Return the least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
-    white = np.array([ws.whiten(c) for c in columns])
+    white = np.array([ws.whiten([table.astype(np.float64) for table in c]) for c in columns])
     patterns = fourth(ws, white)
     gram = white @ white.T
     lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))

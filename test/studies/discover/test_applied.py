@@ -11,6 +11,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy.sparse import csc_array
 
 from psd_deflection.model.simulation.catalogue import effect_names, make_active
 from psd_deflection.recordings.observation import Observation
@@ -147,7 +148,7 @@ def test_what_rings_on_is_free_after_excluded_samples() -> None:
         lighter = make_active('damping', {'bending_ratio': bending, 'torsion_ratio': torsion}, 'test')
         free = ringing_on(o, 0, [lighter])
         assert all(d.swings and float(d.change.sum()) == 1.0 for d in free)
-        return [tuple(np.argwhere(d.change)[0].tolist()) for d in free]
+        return [tuple(np.argwhere(d.change.toarray())[0].tolist()) for d in free]
 
     stated = RIG.dynamics.bending_damping_ratio, RIG.dynamics.torsion_damping_ratio
     assert pulses(0.51 * stated[0], 0.51 * stated[1]) == []
@@ -160,7 +161,7 @@ def test_a_motion_that_nobody_noted_changes_no_load_that_was() -> None:
     ws = Workspace([Observation('x', RIG, read(HELD), HELD)])
     change = np.zeros_like(HELD)
     change[7000, 0] = 1.0
-    swings = LoadDirection(0, change, 1.0, 'x', 0, swings=True)
+    swings = LoadDirection(0, csc_array(change), 1.0, 'x', 0, swings=True)
     (o,) = ws.with_loads([(swings, 2.0), (swings, 1.0)]).observations
     np.testing.assert_array_equal(o.loads, HELD)
     np.testing.assert_array_equal(o.acting - o.loads, 3.0 * change)
@@ -172,7 +173,7 @@ def test_load_time_is_unseen_in_excluded_samples() -> None:
     volts[7900:9000] = np.nan
     volts[3900:4100, 0] = np.nan
     ws = Workspace([Observation('x', RIG, volts, HELD)])
-    nothing = np.zeros_like(HELD)
+    nothing = csc_array(HELD.shape)
     notes = [CorrectedNote(i, (0.0, 0.0, 0.0), t, t, 0.0) for i, t in enumerate((4.0, 8.0, 12.0, 40.0), start=1)]
     assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
     assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
@@ -189,9 +190,9 @@ def test_the_times_that_nobody_noted_are_free(began: bool, ended: bool) -> None:
     assert [d.axis for d in free[:3]] == [0, 1, 2]
     applied = np.zeros((3, 4000, 3))
     applied[[0, 1, 2], 1000:2500, [0, 1, 2]] = 1.0
-    assert [np.sign(d.change).tolist() for d in free[:3]] == applied.tolist()
+    assert [np.sign(d.change.toarray()).tolist() for d in free[:3]] == applied.tolist()
     wanted = [at for at, there in ((1000, began), (2500, ended)) if there]
-    assert [int(np.abs(d.change).sum(axis=1).argmax()) for d in free[3:]] == pytest.approx(wanted, abs=2)
+    assert [int(np.abs(d.change.toarray()).sum(axis=1).argmax()) for d in free[3:]] == pytest.approx(wanted, abs=2)
 
 
 @pytest.mark.parametrize(('share', 'there'), [(1.1, True), (0.9, False)])

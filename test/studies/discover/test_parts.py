@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.signal import lfilter
+from scipy.sparse import csc_array
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
@@ -172,7 +173,7 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     changes, sd = np.zeros((2, len(o.loads), 3)), np.array([2.0, 5.0])
     changes[0, 300:700, 1] = changes[1, 500:, 0] = 1.0
     changes[1, 500:, 1] = 0.7
-    free = tuple(LoadDirection(0, changes[k], float(sd[k]), 'hung', k) for k in range(2))
+    free = tuple(LoadDirection(0, csc_array(changes[k]), float(sd[k]), 'hung', k) for k in range(2))
     wider = ws.with_free(free)
 
     def shown(loads: FloatArray) -> list[FloatArray]:
@@ -199,7 +200,7 @@ def test_free_loads_are_those_of_bayesian_least_squares() -> None:
     assert ws.with_free((ZeroDirection(0, 1, 1e-6),)).refitted_beside(off, ()).observations[0] is o
     # Five, of which two make the others: of least norm.
     sums = np.array([[1.0, 0.0], [0.7, 0.0], [0.0, 1.0], [1.0, 1.0], [-0.7, 1.0]])
-    five = [LoadDirection(0, np.tensordot(s, changes, 1), 1e4, 'hung', k) for k, s in enumerate(sums)]
+    five = [LoadDirection(0, csc_array(np.tensordot(s, changes, 1)), 1e4, 'hung', k) for k, s in enumerate(sums)]
     got, sds = ws.with_free(five).direction_sd(), np.linalg.norm(np.linalg.pinv(a @ sums.T, rcond=1e-9), axis=1)
     assert list(got.values()) == pytest.approx(sds.tolist(), rel=1e-6)
 

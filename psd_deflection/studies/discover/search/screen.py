@@ -8,18 +8,21 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import chi2
 
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.hidden import Free
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 
-Columns = list[list[FloatArray]]
-"""Per column, per recording: fine-block volts (3P, nf)."""
+Columns = Sequence[Sequence[npt.NDArray[np.floating[Any]]]]
+"""Per column, per recording: fine-block volts (3P, nf), of the precision of a screen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,12 +126,12 @@ def signature_columns(
     def simulate(values: Mapping[str, float]) -> list[FloatArray]:
         return workspace.simulate([*base, ActiveEffect(candidate.effect, values)])
 
-    def minus(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
-        return [x - y for x, y in zip(a, b, strict=True)]
+    def minus(a: list[FloatArray], b: list[FloatArray], sign: float = 1.0) -> list[npt.NDArray[np.float32]]:
+        return [(sign * (x - y)).astype(np.float32) for x, y in zip(a, b, strict=True)]
 
     if candidate.effect.finite:
         return [minus(simulate(candidate.start), nominal)]
-    out: Columns = []
+    out = list[list[npt.NDArray[np.float32]]]()
     effect, start = candidate.effect, candidate.start
     main = next(p for p in effect.parameters if p.kind == 'amplitude')
     dose = {**start, main.name: start[main.name] + main.scale}
@@ -137,8 +140,7 @@ def signature_columns(
         p = effect.parameter(name)
         if p.kind == 'amplitude':
             sign = 1.0 if start[name] + p.scale <= p.maximum else -1.0
-            moved = minus(simulate({**start, name: start[name] + sign * p.scale}), nominal)
-            out.append([sign * m for m in moved])
+            out.append(minus(simulate({**start, name: start[name] + sign * p.scale}), nominal, sign))
         elif p.kind == 'phase':
             partner = effect.parameter(p.partner)
             out.append(minus(simulate({**start, partner.name: partner.scale, name: math.pi / 2.0}), nominal))
@@ -241,7 +243,7 @@ class Screen:
         for candidate, columns in signatures:
             white = rows[at : at + len(columns)]
             for row, column in zip(white, columns, strict=True):
-                row[:] = workspace.whiten(column)
+                row[:] = workspace.whiten([table.astype(np.float64) for table in column])
             # Ignore signatures that change the readings by less than a thousandth of sigma.
             if max(float(np.dot(w, w)) for w in white) < 1e-6:
                 continue
@@ -260,18 +262,22 @@ class Screen:
         """Return the rows of one of its candidates."""
         return next(s for c, s in zip(self.candidates, self.slices, strict=True) if c is candidate)
 
-    def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    def _projected(self, residual: FloatArray, known: FloatArray | Free | None) -> tuple[FloatArray, FloatArray]:
         g = (self.rows @ residual.astype(np.float32)).astype(np.float64)
         fisher = self.fisher
-        if known is not None:
+        if isinstance(known, Free):
+            across = np.array([known.shares(row) for row in self.rows]).reshape(len(self.rows), -1)
+            fisher = fisher - across @ across.T
+            g = g - across @ known.shares(residual)
+        elif known is not None:
             q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
             across = (self.rows @ q.astype(np.float32)).astype(np.float64)
             fisher = fisher - across @ across.T
             g = g - across @ (q.T @ residual)
         return g, fisher
 
-    def score(self, residual: FloatArray, known: FloatArray | None = None) -> list[Score]:
-        """Return every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
+    def score(self, residual: FloatArray, known: FloatArray | Free | None = None) -> list[Score]:
+        """Return every candidate on ``residual`` (D,), best first; ``known``: what is free, or columns (D, p)."""
         g, fisher = self._projected(residual, known)
         count = len(self.candidates)
         out = []

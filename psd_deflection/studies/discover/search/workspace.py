@@ -16,7 +16,17 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.observation import Observation, load_cases
 from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
-from psd_deflection.studies.discover.hidden import FIRST, SETUP, Direction, Free, LoadDirection, added, moved, only_in
+from psd_deflection.studies.discover.hidden import (
+    FIRST,
+    SETUP,
+    Direction,
+    Free,
+    LoadDirection,
+    added,
+    moved,
+    only_in,
+    sparse_rows,
+)
 from psd_deflection.studies.discover.noise import NoiseModel, corners_of, estimate_noise
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, dot_rows, fine_means
@@ -155,7 +165,7 @@ class Workspace(Comparison):
         if self.free is None:
             return white
         less = 1.0 - 1.0 / np.sqrt(1.0 + self.free.energy)
-        return np.asarray(white - (less * (self.free.rows @ white)) @ self.free.rows)
+        return white - self.free.sum(less * self.free.shares(white))
 
     def _white(self, fine: Sequence[FloatArray]) -> FloatArray:
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
@@ -168,28 +178,30 @@ class Workspace(Comparison):
         beside = [*self.base, *effects]
         loads = [d for d in directions if isinstance(d, LoadDirection)]
         nominal = self.simulate(beside) if loads else self.measured
-        tables = []
-        for d in directions:
+
+        def table(d: Direction) -> FloatArray:
             if isinstance(d, LoadDirection):
                 # A free load is large: the change by one of its unit, in proportion.
                 more = self.with_loads([(d, 1.0)]).simulate(beside)
-                tables.append([d.sd * (a - b) for a, b in zip(more, nominal, strict=True)])
-            else:
-                tables.append(d.table(nominal, self.observations[d.recording].rig.sensitivities))
-        nothing = np.zeros((0, 0))
-        return self.replaced(free=self.whitened(Free(tuple(directions), tuple(tables), nothing, nothing, nothing)))
+                return np.concatenate([(d.sd * (a - b)).ravel() for a, b in zip(more, nominal, strict=True)])
+            return np.concatenate(
+                [t.ravel() for t in d.table(nominal, self.observations[d.recording].rig.sensitivities)]
+            )
+
+        tables, nothing = sparse_rows(map(table, directions)), np.zeros((0, 0))
+        return self.replaced(free=self.whitened(Free(tuple(directions), tables, tables, nothing, nothing, nothing)))
 
     def whitened(self, free: Free | None) -> Free | None:
         """``free`` by the noise of this comparison."""
         if free is None:
             return None
-        white = np.array([self._white(t) for t in free.tables])
-        energy, vectors = np.linalg.eigh(white @ white.T)
+        tables = (free.tables[[i]].toarray().ravel() for i in range(len(free.directions)))
+        white = sparse_rows(self._white(self.split(t)) for t in tables)
+        energy, vectors = np.linalg.eigh((white @ white.T).toarray())
         observable = energy > max(1e-6, 1e-14 * float(energy.max()))
         energy, vectors = energy[observable], vectors[:, observable]
-        rows = (vectors / np.sqrt(energy)).T @ white
         back = np.array([d.sd for d in free.directions])[:, None] * vectors
-        return Free(free.directions, free.tables, rows, energy, back)
+        return Free(free.directions, free.tables, white, vectors / np.sqrt(energy), energy, back)
 
     def with_loads(self, more: Sequence[tuple[Direction, float]]) -> Self:
         """With the loads changed."""
@@ -242,7 +254,7 @@ class Workspace(Comparison):
         return self.with_loads(more).with_free(moved(more), effects)
 
     def _implied_loads(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
-        sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
+        sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * free.shares(self._white(difference)))
         return list(zip(free.directions, sizes.tolist(), strict=True))
 
     def direction_sd(self) -> dict[tuple[int, int], float]:
