@@ -281,6 +281,8 @@ def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(launch: Launch, p
     plant = following(peer)
     flag.touch()
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
+    # Every 10 ms by 0.1 /s.
+    assert np.isclose(np.abs(np.diff(plant.offsets[-8:], axis=0)), 0.1 * 0.01, rtol=1e-6).any()
     assert plant.step() <= WITHIN
     peer.until(lambda: node.process.poll() is not None, 'its end')
     assert node.process.returncode == 1

@@ -5,6 +5,7 @@
 import itertools
 import queue
 import re
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,13 +109,23 @@ def test_a_device_restart_continues_with_a_new_block(device: Any, run: Run, samp
     assert all(b > a for a, b in itertools.pairwise(t))
 
 
-def test_reader_waits_for_an_unplugged_device_and_resumes(device: Any, run: Run, sample: Any) -> None:
+def test_reader_waits_for_an_unplugged_device_and_resumes(
+    device: Any, run: Run, sample: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits, wait = set[float | None](), threading.Event.wait
+
+    def recorded_wait(event: threading.Event, seconds: float | None = None) -> bool:
+        waits.add(seconds)
+        return wait(event, seconds)
+
     device.send_frames(*[sample(s) for s in range(25)])
     take(run.acquisition, 20)
+    monkeypatch.setattr(threading.Event, 'wait', recorded_wait)
     device.unplug()
     run.heard('waiting for it to come back')
     device.plug()
     run.heard('the device is back')
+    assert 0.2 in waits
     assert device.greeted.wait(WAIT_S)
     device.send_frames(*[sample(s) for s in range(1000, 1020)])
     items = take(run.acquisition, 25)
