@@ -281,8 +281,6 @@ def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(launch: Launch, p
     plant = following(peer)
     flag.touch()
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
-    # Every 10 ms by 0.1 /s.
-    assert np.isclose(np.abs(np.diff(plant.offsets[-8:], axis=0)), 0.1 * 0.01, rtol=1e-6).any()
     assert plant.step() <= WITHIN
     peer.until(lambda: node.process.poll() is not None, 'its end')
     assert node.process.returncode == 1
@@ -315,6 +313,9 @@ def test_a_way_out_without_memory_or_log_leaves_no_offset(program: list[str], la
     else:
         peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
+    # Then every 10 ms by what the rate of 0.1 /s allows.
+    steps = np.abs(np.diff(plant.offsets[-8:], axis=0))
+    assert program[0] == 'sh' or np.isclose(steps, 0.1 * 0.01, rtol=1e-6).any()
     assert plant.step() <= WITHIN
 
 
