@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import AsyncMock, Mock, call
 from urllib.parse import urlencode
@@ -573,11 +574,13 @@ def test_a_scrape_has_counters_and_the_newest_estimate(serve: Serve, monkeypatch
 
 
 def test_the_estimate_of_a_device_that_is_away_is_no_estimate(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, 'FRESH_S', 0.0)
+    clock = [0.0]
+    monkeypatch.setattr(server, 'time', SimpleNamespace(**{**vars(time), 'monotonic': lambda: clock[0]}))
     serving = serve()
     serving.give(0, 1)
     shown(serving, 0)
-    assert not any('meters' in key[0] or 'volts' in key[0] for key in scraped(serving))
+    for clock[0], fresh in ((1.9, True), (2.1, False)):
+        assert any('meters' in key[0] or 'volts' in key[0] for key in scraped(serving)) is fresh
 
 
 @pytest.mark.parametrize(('headers', 'status'), [({'Host': 'evil.example'}, 403), ({}, 200)])
