@@ -33,6 +33,7 @@ from test.heard import WAIT_S
 from test.run.conftest import HELLO
 
 pytestmark = pytest.mark.slow
+SILENCE_S = module.SILENCE_S
 
 
 def take(acquisition: Acquisition, n: int) -> list[Item]:
@@ -511,11 +512,16 @@ def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
     return acquisition
 
 
-def test_a_ping_is_answered_and_bounds_the_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pings_bound_the_delay_and_2_s_without_samples_count(monkeypatch: pytest.MonkeyPatch) -> None:
     acquisition = pinged(Asked(30), monkeypatch)
     # The last one was asked when nothing more came.
     assert (acquisition.counters.pings, acquisition.counters.pongs) == (30, 29)
     assert acquisition.clock_state().round_trip_ns == 500_000_000
+    # Nothing comes for 6 s, half a second a read.
+    read = Asked.read
+    monkeypatch.setattr(module, 'SILENCE_S', SILENCE_S)
+    monkeypatch.setattr(Asked, 'read', lambda source, seconds: read(source, seconds)._replace(events=[], size=0))
+    assert pinged(Asked(12), monkeypatch).counters.silences == 2
 
 
 @pytest.fixture
