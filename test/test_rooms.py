@@ -3,9 +3,12 @@
 """The rooms: mutants in each of them, no class name for two things, a bound for what grows."""
 
 import ast
+import importlib
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -32,6 +35,17 @@ def test_each_mutant_made_by_hand_changes_a_line_of_a_room() -> None:
     for m in hand_made():
         assert any(m.file == path or m.file.startswith(f'{path}/') for path in rooms), m.file
         ast.parse(m.code((ROOT / m.file).read_text()))
+
+
+@pytest.mark.parametrize(('noticed', 'status'), [(95, 0), (94, 1)])
+def test_mutants_fail_below_95_percent(monkeypatch: pytest.MonkeyPatch, noticed: int, status: int) -> None:
+    """Without cosmic-ray, which has an environment of its own."""
+    for name in ('', '.ast', '.mutating', '.plugins'):
+        monkeypatch.setitem(sys.modules, f'cosmic_ray{name}', Mock())
+    mutants = importlib.import_module('tools.mutants')
+    made = [('x', 'quick')] * noticed + [('x', '')] * (100 - noticed)
+    monkeypatch.setattr(mutants, 'tried', lambda *_: made)
+    assert mutants.main(['--rooms', 'solvers']) == status
 
 
 PACKAGE = Path(psd_deflection.__file__).parent

@@ -70,12 +70,9 @@ def test_names_of_long_ago_make_room_for_new_ones() -> None:
     assert len(known) == 1
 
 
-def test_a_robot_of_which_nothing_is_reported_runs() -> None:
-    assert RobotWatch().fault(1e9) == ''
-
-
 def test_driver_run_state_persists_until_next_report() -> None:
     robot = RobotWatch()
+    assert robot.fault(1e9) == ''
     robot.runs(False)
     assert robot.fault(1e6) == 'the robot does not run'
     robot.runs(True)

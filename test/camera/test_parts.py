@@ -26,7 +26,7 @@ from psd_deflection.camera.discs import find_discs
 from psd_deflection.camera.footage import Footage, decoded, of_ros_image, read_image, read_settings
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.opencv import MOST_BYTES, MOST_PIXELS, declared_size
+from psd_deflection.camera.opencv import check_size, checked, declared_size
 from psd_deflection.camera.reference import CameraReference, mean_pose, relative, relative_covariance
 from psd_deflection.camera.refine_corners import refined
 from psd_deflection.camera.rim_classifier import RimClassifier, sectors_of
@@ -559,13 +559,16 @@ def test_nothing_is_unpacked_of_an_image_that_is_too_large(name: str, monkeypatc
     rejected = decoded(LARGE[name], Cv2)
     assert isinstance(rejected, NoPoseError)
     assert str(rejected) == 'image too large (32767 x 32767 px)'
+    check_size(10_000, 5_000)
+    with pytest.raises(NoPoseError):
+        check_size(50_001, 1_000)
 
 
 def test_opencv_has_the_same_bound_for_what_is_not_known_here() -> None:
     code = 'from psd_deflection.camera.opencv import opencv; opencv(); import os; print(os.environ[NAME])'
     code = code.replace('NAME', repr('OPENCV_IO_MAX_IMAGE_PIXELS'))
     reported = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
-    assert int(reported) == MOST_PIXELS
+    assert int(reported) == 50_000_000
     # A Sun raster, which is not read here.
     head = struct.pack('>8I', 0x59A66A95, 32767, 32767, 1, 32767 * 4096, 1, 0, 0)
     code = (
@@ -581,11 +584,16 @@ def test_opencv_has_the_same_bound_for_what_is_not_known_here() -> None:
 
 
 def test_a_file_that_is_too_long_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Zeros that nobody writes take no memory.
+    longest = np.zeros(400_000_001, np.uint8)
+    checked(longest[1:].data)
+    with pytest.raises(NoPoseError, match='a file of 400 MB'):
+        checked(longest.data)
     monkeypatch.setattr(footage, 'MOST_BYTES', 1000)
     monkeypatch.setattr('psd_deflection.camera.opencv.MOST_BYTES', 1000)
     path = tmp_path / 'long.png'
     with path.open('wb') as stream:
-        stream.truncate(MOST_BYTES)
+        stream.truncate(400_000_001)
     rejected = read_image(path)
     assert isinstance(rejected, NoPoseError)
     assert rejected.status is Status.TOO_LARGE

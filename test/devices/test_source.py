@@ -109,11 +109,8 @@ def chunks(items: list[Item]) -> list[Arrival]:
     return [i for i in items if isinstance(i, Arrival)]
 
 
-def test_our_own_name_makes_our_own_source() -> None:
+def test_a_source_is_ours_or_that_of_an_entry_point() -> None:
     assert isinstance(make_source(load_rig(overrides={'port': 'x'})), ContractFrames)
-
-
-def test_a_plug_in_is_found_by_its_entry_point() -> None:
     assert isinstance(make_source(load_rig(overrides={'source': 'scripted'})), Scripted)
     assert source_names()[0] == 'serial'
     assert 'scripted' in source_names()

@@ -229,11 +229,8 @@ SCAN = bytes.fromhex('0100 feff 0040 0001 0180 0040 0080')
 COUNTS = (1, -2, 16384, 256, -32767, 16384)
 
 
-def test_ten_volts_are_half_of_16_bits() -> None:
+def test_commands_and_counts_are_those_of_the_protocol() -> None:
     assert dataq.VOLTS_PER_COUNT * 2**15 == 10.0
-
-
-def test_commands_end_in_a_carriage_return() -> None:
     assert dataq.command('srate 60000') == b'srate 60000\r'
     assert dataq.scan_list(range(6)) == [*(f'slist {n} {n}' for n in range(6)), 'slist 6 10']
 

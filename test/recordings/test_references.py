@@ -71,14 +71,11 @@ def test_a_fault_is_named(tmp_path: Path, text: str, message: str) -> None:
         read_references(written(tmp_path, text))
 
 
-def test_a_table_that_is_no_text_is_rejected(tmp_path: Path) -> None:
+def test_a_table_that_is_no_text_or_not_there_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / 'camera.csv'
     path.write_bytes(b't,dx,dy,theta\n0,0,0,\xff\xfe\n')
     with pytest.raises(RecordingError, match='is not text in UTF-8'):
         read_references(path)
-
-
-def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='cannot be read'):
         read_references(tmp_path / 'none.csv')
 

@@ -111,6 +111,15 @@ def test_each_joined_sample_is_a_reading_of_both(tmp_path: Path, every: int, off
         assert {tuple(row) for row in samples[names].tolist()} <= rows
 
 
+@pytest.mark.parametrize(('before', 'lost'), [(0.007, 0), (0.008, 1)])
+def test_a_reading_three_quarters_of_a_period_away_is_lost(tmp_path: Path, before: float, lost: int) -> None:
+    """Both loggers lack a reading, the second that nearest to what the first one then has."""
+    rows, t = np.arange(200), 0.01 * np.arange(200)
+    ours = write_table(tmp_path / '1.csv', np.delete(t, 99), np.delete(rows, 99), 1)
+    theirs = write_table(tmp_path / '2.csv', np.delete(t + 0.01 - before, 100), np.delete(rows, 100), 2)
+    assert join(ours, theirs, 0.0).lost == lost
+
+
 @pytest.mark.parametrize(('size', 'scatter'), [(3.0, 9.0 * 8.0 / 6.0), (0.3, 1.0)])
 def test_the_line_of_a_clock_is_as_sure_as_its_scatter_at_most(size: float, scatter: float) -> None:
     """Eight offsets about a line leave six degrees of freedom; their places scatter by 42 about the middle."""

@@ -313,6 +313,9 @@ def test_a_way_out_without_memory_or_log_leaves_no_offset(program: list[str], la
     else:
         peer.change('/compensator', Transition.TRANSITION_DEACTIVATE)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
+    # Then every 10 ms by what the rate of 0.1 /s allows.
+    steps = np.abs(np.diff(plant.offsets[-8:], axis=0))
+    assert program[0] == 'sh' or np.isclose(steps, 0.1 * 0.01, rtol=1e-6).any()
     assert plant.step() <= WITHIN
 
 

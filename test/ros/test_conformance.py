@@ -415,10 +415,6 @@ def test_numbers_have_bounds(running: Running) -> None:
     assert free == []
 
 
-def test_parameter_file_is_read(running: Running) -> None:
-    assert {name: running.get(name) for name in running.profile.params} == dict(running.profile.params)
-
-
 @pytest.mark.parametrize('name', nodes_of_setup())
 @pytest.mark.parametrize('why', ['unknown', pytest.param('out of bounds', marks=pytest.mark.slow)])
 def test_invalid_parameter_ends_the_start(name: str, why: str, domain: int, tmp_path: Path) -> None:
@@ -430,7 +426,8 @@ def test_invalid_parameter_ends_the_start(name: str, why: str, domain: int, tmp_
     assert why == 'unknown' or 'must be' in ended.stderr
 
 
-def test_unknown_parameter_cannot_be_set(running: Running) -> None:
+def test_a_parameter_is_of_the_file_or_it_is_unknown(running: Running) -> None:
+    assert {name: running.get(name) for name in running.profile.params} == dict(running.profile.params)
     answer = running.set('max_ofset', 0.5)
     assert not answer.successful
     assert 'max_ofset' in answer.reason
@@ -476,11 +473,8 @@ def test_live_parameter_acts(running: Running) -> None:
     assert running.set(name, before).successful
 
 
-def test_log_is_on_rosout(running: Running) -> None:
+def test_log_and_diagnostics_are_named_after_the_node(running: Running) -> None:
     running.peer.until(lambda: any(line.name == f'left.{running.name}' for line in running.lines), 'its log')
-
-
-def test_diagnostics_are_named_after_the_node(running: Running) -> None:
     names = {status.name for report in running.reports for status in report.status}
     prefix = f'left/{running.name}'
     assert [name for name in names if not name.startswith((f'{prefix}: ', f'{prefix}/'))] == []

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What viewers are given: the tree of frames, latched markers and geometry, the robot's description."""
 
+import contextlib
 import importlib.util
 import math
 import os
@@ -21,7 +22,7 @@ from psd_deflection.base.log import null_log, texts
 from psd_deflection.records import BlockStatus, DeflectionEstimate, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.ros.gate import robot_description
-from psd_deflection.ros.markers import at_rest, moving
+from psd_deflection.ros.markers import RigMarkers, at_rest, moving
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.sinks import TransformPublisher, static_transforms, tip_transform, topics_of
 from psd_deflection.run.processing import RecordSink
@@ -217,6 +218,11 @@ def test_markers_are_in_prefixed_frames() -> None:
     rig = load_rig(overrides={'frame_prefix': 'left_'})
     drawn = (*at_rest(rig).markers, *moving(rig, bent_by(), spots((0.0, 0.0, 0.0, 0.0)), 10.0).markers)
     assert {m.header.frame_id for m in drawn} == {'left_link_base'}
+
+
+def test_markers_are_published_ten_times_a_second(peer: Any) -> None:
+    with contextlib.closing(RigMarkers(peer.node, RIG)):
+        assert [timer.timer_period_ns for timer in peer.node.timers] == [100_000_000]
 
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

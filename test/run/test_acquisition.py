@@ -5,6 +5,7 @@
 import itertools
 import queue
 import re
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,7 @@ from test.heard import WAIT_S
 from test.run.conftest import HELLO
 
 pytestmark = pytest.mark.slow
+SILENCE_S = module.SILENCE_S
 
 
 def take(acquisition: Acquisition, n: int) -> list[Item]:
@@ -108,13 +110,23 @@ def test_a_device_restart_continues_with_a_new_block(device: Any, run: Run, samp
     assert all(b > a for a, b in itertools.pairwise(t))
 
 
-def test_reader_waits_for_an_unplugged_device_and_resumes(device: Any, run: Run, sample: Any) -> None:
+def test_reader_waits_for_an_unplugged_device_and_resumes(
+    device: Any, run: Run, sample: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits, wait = set[float | None](), threading.Event.wait
+
+    def recorded_wait(event: threading.Event, seconds: float | None = None) -> bool:
+        waits.add(seconds)
+        return wait(event, seconds)
+
     device.send_frames(*[sample(s) for s in range(25)])
     take(run.acquisition, 20)
+    monkeypatch.setattr(threading.Event, 'wait', recorded_wait)
     device.unplug()
     run.heard('waiting for it to come back')
     device.plug()
     run.heard('the device is back')
+    assert 0.2 in waits
     assert device.greeted.wait(WAIT_S)
     device.send_frames(*[sample(s) for s in range(1000, 1020)])
     items = take(run.acquisition, 25)
@@ -500,11 +512,16 @@ def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
     return acquisition
 
 
-def test_a_ping_is_answered_and_bounds_the_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pings_bound_the_delay_and_2_s_without_samples_count(monkeypatch: pytest.MonkeyPatch) -> None:
     acquisition = pinged(Asked(30), monkeypatch)
     # The last one was asked when nothing more came.
     assert (acquisition.counters.pings, acquisition.counters.pongs) == (30, 29)
     assert acquisition.clock_state().round_trip_ns == 500_000_000
+    # Nothing comes for 6 s, half a second a read.
+    read = Asked.read
+    monkeypatch.setattr(module, 'SILENCE_S', SILENCE_S)
+    monkeypatch.setattr(Asked, 'read', lambda source, seconds: read(source, seconds)._replace(events=[], size=0))
+    assert pinged(Asked(12), monkeypatch).counters.silences == 2
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from psd_deflection.records import AppliedLoad, Mark, Record, ReferencePose
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run import processing
 from psd_deflection.run import session as module
-from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
+from psd_deflection.run.diagnostics import OK, STALE, WARN, HealthReporter
 from psd_deflection.run.monitor.metrics import text_of
 from psd_deflection.run.monitor.shown import RejectedError, ShownSession
 from psd_deflection.run.rate_limited_log import RateLimitedLog
@@ -136,6 +136,15 @@ def test_a_step_of_the_system_clock_moves_no_stamp(running: Running, monkeypatch
     monkeypatch.setattr(time, 'time_ns', lambda: real() - 3600 * 10**9)
     assert before <= acquisition.now_ns() < before + 600 * 10**9
     assert acquisition.system_clock_step_ns() == pytest.approx(-3600e9, abs=1e9)
+
+
+def test_stamps_late_by_more_than_5_ms_are_a_warning(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = running.session.acquisition.clock_state()._replace(residual_ns=0.0)
+    for late_ns, level in ((4_900_000, OK), (5_100_000, WARN)):
+        clock = state._replace(round_trip_ns=late_ns)
+        monkeypatch.setattr(running.session.acquisition, 'clock_state', lambda clock=clock: clock)
+        entries = {e.name: e.level for e in HealthReporter(running.session).report(0).entries}
+        assert entries['psd_deflection: clock'] == level
 
 
 def test_zero_of_long_silent_device_is_rejected(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -357,6 +357,7 @@ def test_a_request_that_was_begun_is_waited_for(items: ItemQueue, monkeypatch: p
     processing, held = Processing(items, Pipeline(load_rig()), texts(print)), HeldRequest()
 
     def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
+        assert timeout == 2.0
         if not held.go_on.is_set():
             # The first time: its time is up in the middle of it.
             assert held.begun.wait(WAIT_S)

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,14 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.observation import read_observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed_estimates, rig_at_start
-from psd_deflection.records import AppliedLoad, DeflectionEstimate, FloatArray, RawChunk
+from psd_deflection.records import AppliedLoad, DeflectionEstimate, FloatArray, RawChunk, SampleBlock
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run import watcher as module
 from psd_deflection.run.diagnostics import OK, WARN, HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.session import Session
 from psd_deflection.run.watcher import Watcher, WatcherSink
-from test.heard import WAIT_S
+from test.heard import WAIT_S, until
 from test.run.conftest import Estimates, ScriptedDevice
 
 pytestmark = pytest.mark.slow
@@ -72,8 +73,14 @@ class Chain:
             for record in self.pipeline.process(chunk):
                 if isinstance(record, DeflectionEstimate):
                     self.poses[record.t_ns] = record.pose
+                elif isinstance(record, SampleBlock):
+                    self._samples = record
                 self.fanout.put(record)
                 self.watcher.put(record)
+
+    def block(self, t_ns: int) -> None:
+        """The last samples again, as those of this time."""
+        self.watcher.put(replace(self._samples, t_ns=np.array([t_ns])))
 
     def bump(self) -> None:
         """Eight seconds under no load, then six after x1 has moved."""
@@ -103,10 +110,7 @@ def volts_of(folder: Path) -> FloatArray:
     return read_observation(folder).volts
 
 
-def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, 'AFTER_NS', 3_000_000_000)
+def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(tmp_path: Path) -> None:
     chain = Chain(tmp_path)
     chain.feed(1.0)
     chain.load(0.0, 0.0, 0.0)
@@ -114,6 +118,11 @@ def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
     assert chain.watcher.entry().level == OK
     assert not list(tmp_path.iterdir())
     chain.feed(10.0, BUMP)
+    assert chain.watcher.watch.alarm is not None
+    for after in (59, 61):
+        assert (chain.watcher.folder, not list(tmp_path.iterdir())) == (None, True)
+        chain.block(chain.watcher.watch.alarm.observed_ns + after * 1_000_000_000)
+    until(lambda: chain.watcher.folder is not None)
     assert chain.watcher.close(60.0) == ''
     (folder,) = tmp_path.iterdir()
     assert folder == chain.watcher.folder
@@ -126,8 +135,8 @@ def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
     assert chain.logged[0].startswith('watch: since 2023-11-1')
     assert str(folder) in chain.logged[1]
     observation = read_observation(folder)
-    # From the first whole block to three seconds after the alarm, which is some seconds after the bump.
-    assert 16.0 < observation.duration < 20.0
+    # From the first whole block on.
+    assert 20.9 < observation.duration <= 21.0
     assert np.ptp(observation.loads) == 0.0
     assert float(np.nanmean(volts_of(folder)[-1000:, 0]) - np.nanmean(volts_of(folder)[:1000, 0])) == pytest.approx(
         0.01, abs=5e-4
@@ -191,6 +200,21 @@ def test_input_flood_without_device_is_bounded(tmp_path: Path) -> None:
         'watch: 1 MB are full (watch_memory): what is kept begins later than watch_minutes says'
     ]
     assert int(dict(chain.watcher.entry().values)['dropped from memory, because it was full']) > 0
+
+
+def test_of_a_full_memory_the_oldest_30_s_are_dropped(tmp_path: Path) -> None:
+    chain = Chain(tmp_path, watch_memory=1_000_000)
+    chain.feed(0.2)
+    topic, kind, message, _ = a_load(START_NS)
+    held = []
+    for second in range(1, 200):
+        t_ns = START_NS + second * 1_000_000_000
+        chain.block(t_ns)
+        chain.watcher.put_message(topic, kind, message.ljust(10_000), t_ns)
+        held.append(chain.watcher.held_bytes)
+    size, *_ = steps = np.diff(held)
+    # Without what was fed before the first of them.
+    assert steps[steps < 0][1:].tolist() == [-29 * size] * 3
 
 
 def test_nothing_is_held_of_a_device_that_has_been_away_for_long(tmp_path: Path) -> None:

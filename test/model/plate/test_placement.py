@@ -48,9 +48,7 @@ def test_three_sensors_see_tilt_only_when_staggered() -> None:
     assert staggered[3:] * mdeg == pytest.approx([0.93, 1.32], abs=5e-3)
     at_rest = placement.pose_deviations(np.zeros(5), ring, np.zeros(3), SIGMA)
     assert np.isfinite(at_rest).tolist() == [True, True, True, False, False]
-
-
-def test_two_sensors_leave_a_direction_unseen() -> None:
+    # Two leave a direction unseen.
     tilted = np.array([0.001, 0.002, 0.01, 0.004, 0.003])
     assert not np.any(np.isfinite(placement.pose_deviations(tilted, THESIS, np.array([0.05, -0.05]), SIGMA)))
 

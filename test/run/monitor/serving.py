@@ -102,35 +102,18 @@ class StillShown:
 def spots_of(index: int, *, status: BlockStatus = BlockStatus.OK, lost: int = 0) -> SpotMeans:
     phase = index / 10.0
     dots = (1e-3 * np.cos(phase), 2e-3 * np.sin(phase), 0.5e-3, -1e-3 * np.sin(phase))
-    return SpotMeans(
-        START_NS + index * BLOCK_NS,
-        index,
-        (float(dots[0]), float(dots[1]), dots[2], float(dots[3])),
-        (5.0, 5.0),
-        np.zeros((4, 4)),
-        20 - lost,
-        lost,
-        status,
-        '' if status is BlockStatus.OK else 'a reason',
-    )
+    t_ns, why = START_NS + index * BLOCK_NS, '' if status is BlockStatus.OK else 'a reason'
+    places = (float(dots[0]), float(dots[1]), dots[2], float(dots[3]))
+    return SpotMeans(t_ns, index, places, (5.0, 5.0), np.zeros((4, 4)), 20 - lost, lost, status, why)
 
 
 def estimate_of(index: int, *, primary: bool = True, scale: float = 1.0) -> DeflectionEstimate:
     phase = index / 10.0
     sd = (2e-7 * scale, 3e-7 * scale, 3e-6 * scale)
     covariance = (sd[0] ** 2, 0.0, 0.0, 0.0, sd[1] ** 2, 0.0, 0.0, 0.0, sd[2] ** 2)
+    pose = (float(1e-3 * np.sin(phase)), float(-1e-3 * np.cos(phase)), float(1e-2 * np.sin(phase)))
     return DeflectionEstimate(
-        START_NS + index * BLOCK_NS,
-        index,
-        'exact',
-        float(1e-3 * np.sin(phase)),
-        float(-1e-3 * np.cos(phase)),
-        float(1e-2 * np.sin(phase)),
-        0.0,
-        0.0,
-        covariance,
-        1e-7,
-        primary,
+        START_NS + index * BLOCK_NS, index, 'exact', *pose, 0.0, 0.0, covariance, 1e-7, primary=primary
     )
 
 

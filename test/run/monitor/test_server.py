@@ -8,10 +8,13 @@ import json
 import math
 import re
 import socket
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock, call
 from urllib.parse import urlencode
 
 import aiohttp
@@ -378,6 +381,42 @@ def test_idle_connections_do_not_use_up_the_daemons_files(serve: Serve) -> None:
     asyncio.run(asyncio.wait_for(go(), WAIT_S))
 
 
+def test_a_browser_silent_for_15_s_is_disconnected(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is asked after 10 s and has 5 s, by a clock that is put forward."""
+    ahead = [0.0]
+
+    def now(_: asyncio.BaseEventLoop) -> float:
+        return time.monotonic() + ahead[0] * (threading.current_thread().name == 'monitor')
+
+    monkeypatch.setattr(asyncio.BaseEventLoop, 'time', now)
+    serving = serve()
+
+    async def go() -> None:
+        async with aiohttp.ClientSession() as http, http.ws_connect(serving.url + 'ws', autoping=False) as browser:
+            assert 'hello' in (await browser.receive()).data
+            for n, (ahead[0], wanted) in enumerate(((7.0, ''), (13.0, 'PING'), (16.5, ''), (20.0, 'CLOSED'))):
+                kinds = set()
+                for row in range(3 * n, 3 * n + 3):
+                    serving.give(row, 1)
+                    while (got := await browser.receive()).type.name == 'TEXT' and 'rows' not in got.data:
+                        pass
+                    kinds.add(got.type.name)
+                assert ''.join(kinds - {'TEXT'}) == wanted
+
+    asyncio.run(asyncio.wait_for(go(), WAIT_S))
+
+
+def test_new_rows_are_looked_for_every_30_ms(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept = AsyncMock(side_effect=[None, asyncio.CancelledError])
+    monkeypatch.setattr(asyncio, 'sleep', slept)
+    rig = load_rig(overrides={'monitor_history': False})
+    pump, health = MonitorServer(StillShown(rig), Feed(), rig.monitor, null_log).jobs()
+    health.close()
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(pump)
+    assert slept.call_args_list == [call(0.03)] * 2
+
+
 def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
     serving = serve()
 
@@ -483,12 +522,9 @@ def test_a_request_must_come_from_our_own_page_or_from_none(headers: dict[str, s
     assert is_own_page(headers) is local
 
 
-def test_only_loopback_is_loopback() -> None:
+def test_loopback_and_a_token_are_told_from_others() -> None:
     assert all(map(is_loopback, ('127.0.0.1', '127.1.2.3', '::1', 'localhost', '127.0.0.1%x')))
     assert not any(map(is_loopback, ('0.0.0.0', '::', '192.0.2.1', 'rig', '')))
-
-
-def test_a_token_is_right_or_wrong() -> None:
     assert is_token('abc', 'abc')
     assert not any(is_token(given, 'abc') for given in (None, '', 'ab', 'abcd', 'ähc', 'ab\udce9'))
 
@@ -538,11 +574,13 @@ def test_a_scrape_has_counters_and_the_newest_estimate(serve: Serve, monkeypatch
 
 
 def test_the_estimate_of_a_device_that_is_away_is_no_estimate(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, 'FRESH_S', 0.0)
+    clock = [0.0]
+    monkeypatch.setattr(server, 'time', SimpleNamespace(**{**vars(time), 'monotonic': lambda: clock[0]}))
     serving = serve()
     serving.give(0, 1)
     shown(serving, 0)
-    assert not any('meters' in key[0] or 'volts' in key[0] for key in scraped(serving))
+    for clock[0], fresh in ((1.9, True), (2.1, False)):
+        assert any('meters' in key[0] or 'volts' in key[0] for key in scraped(serving)) is fresh
 
 
 @pytest.mark.parametrize(('headers', 'status'), [({'Host': 'evil.example'}, 403), ({}, 200)])

@@ -176,9 +176,7 @@ def test_the_links_of_the_thesis_have_its_50_newtons() -> None:
     assert list(default_load(RIG)) == pytest.approx([0.0, -50.0, -29.25], rel=1e-12)
     # What is no part of the layout does not count.
     assert default_load(replace_values(RIG, {'amplifier.noise': 1e-3, 'psd_1.zero': [1e-4, 0.0]}))[1] == -50.0
-
-
-def test_without_room_there_is_no_load() -> None:
+    # Without room there is none.
     rig = replace_values(RIG, {'psd_1.active_area': [0.004, 0.004], 'psd_1.zero': [0.0, 0.003]})
     assert [abs(v) for v in default_load(rig)] == [0.0, 0.0, 0.0]
 

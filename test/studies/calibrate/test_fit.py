@@ -153,6 +153,15 @@ def test_the_evidence_of_a_prior_is_the_probability_of_all_readings_at_once() ->
     assert off[0] == pytest.approx(off[1], abs=5e-3)
 
 
+def test_frames_with_a_chi_square_above_27_are_excluded() -> None:
+    rows = rows_of_two(np.zeros(4))
+    rows.pose[::40, 0] += 2e-5 * np.linspace(5.0, 7.0, 3)
+    best = fitting.fit(rows, RIG, PRIOR, 'reference', free=np.arange(SIZE) < 4)
+    off, inverse = best.linear.residual, fitting.weight_matrices(best.linear, rows, best.noise)
+    chi_square = np.einsum('ni,nij,nj->n', off, inverse, off) * best.noise.fewer
+    assert best.weights.tolist() == (chi_square < 27.0).tolist()
+
+
 def test_without_reference_the_noise_of_the_dots_alone_is_found() -> None:
     free = np.arange(SIZE) < ZERO // 2
     noise = fitting.fit(rows_of_two(np.zeros(4)), RIG, PRIOR, 'self', free=free).noise
@@ -386,10 +395,13 @@ def test_uninformed_parameters_are_undetermined() -> None:
     pair[[a, b]] = 1.0 / PRIOR.sd[[a, b]]
     information[[a, b], [a, b]] = 0.0
     information += 1e4 * np.outer(pair, pair)
+    # Of two lengths it knows a little: to 0.89 and to 0.91 of the tolerance.
+    for name, ratio in (('psd_1.center_x', 0.89), ('psd_1.center_y', 0.91)):
+        information[INDEX[name], INDEX[name]] = (ratio**-2 - 1.0) / PRIOR.sd[INDEX[name]] ** 2
     covariance = fitting.posterior(information, PRIOR, free)
     full = cast(Any, SimpleNamespace(covariance=covariance, information=information, free=free))
     parts = {tuple(sorted(d.parts)): d.parts for d in undetermined(full, PRIOR)}
-    assert set(parts) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
+    assert set(parts) == {('psd_2.height',), ('psd_1.center_y',), ('psd_1.gain_x', 'psd_2.gain_x')}
     first, other = parts['psd_1.gain_x', 'psd_2.gain_x'].values()
     assert (abs(first), first + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
 

@@ -21,7 +21,6 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.observation import read_observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.check import shared_findings
 from psd_deflection.studies.check.checkup import check, of_recording, responses
@@ -421,8 +420,8 @@ def test_quantisation_noise_is_step_over_root_12() -> None:
         (11, 0.04004, 9, '40 mV, the rig file says 9.77 mV'),
         # A third more is no bit, and fewer than eight no converter has.
         (16, 0.0004, None, '0.4 mV, the rig file says 0.305 mV'),
-        (16, 20.0 / 2**LEAST_BITS, LEAST_BITS, ''),
-        (16, 40.0 / 2**LEAST_BITS, None, ''),
+        (16, 20.0 / 2**8, 8, ''),
+        (16, 40.0 / 2**8, None, ''),
     ],
 )
 def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: int | None, words: str) -> None:

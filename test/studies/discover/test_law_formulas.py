@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
@@ -146,21 +147,8 @@ def test_two_levels_are_separated_from_a_stated_gain_on() -> None:
 
 
 def test_times_that_show_are_terms_and_become_better(observed: tuple[Workspace, Fit]) -> None:
-    workspace = Workspace(
-        [
-            make_observation(
-                4,
-                (
-                    ActiveEffect(
-                        effect_of(
-                            law := Law('bump', 'psd', 'y1', (LawTerm('switched', (), 3e-5, times=(0.313, 0.871)),))
-                        ),
-                        values_of(law),
-                    ),
-                ),
-            )
-        ]
-    )
+    law = Law('bump', 'psd', 'y1', (LawTerm('switched', (), 3e-5, times=(0.313, 0.871)),))
+    workspace = Workspace([make_observation(4, (ActiveEffect(effect_of(law), values_of(law)),))])
     answers = responses(workspace, refit(workspace, ()))
     first, *_ = switchings(answers, ('y1',))
     assert (first.form, first.of) == ('switched', ())
@@ -213,15 +201,8 @@ def test_fitted_law_has_fit_numbers_and_deviations() -> None:
     values = {'c1': 2.0, 'threshold1': 5.0, 'c2': -3.0}
     beside = make_active('sensor_gain', {'psd': 1, 'x': 0.1, 'y': 0.2}, 'test')
     jacobian = np.random.default_rng(0).standard_normal((30, 5)) * [1.0, 2.0, 3.0, 4.0, 0.005]
-    fit = Fit(
-        (beside, ActiveEffect(effect_of(law), values)),
-        0.0,
-        np.zeros(30),
-        [],
-        jacobian,
-        ((0, 'x'), (0, 'y'), (1, 'c1'), (1, 'threshold1'), (1, 'c2')),
-        (),
-    )
+    free = ((0, 'x'), (0, 'y'), (1, 'c1'), (1, 'threshold1'), (1, 'c2'))
+    fit = Fit((beside, ActiveEffect(effect_of(law), values)), 0.0, np.zeros(30), [], jacobian, free, ())
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     np.testing.assert_allclose(laws.term_covariance(fit), covariance, rtol=1e-6)
     sd = np.sqrt(np.diag(covariance))
@@ -311,7 +292,7 @@ def test_variances_are_the_likeliest() -> None:
     assert law_features.variance(np.full(10, 1e-6), np.linspace(0.0, 1.0, 10)) == pytest.approx((0.05, 0.0), abs=1e-9)
 
 
-def test_noise_growing_with_load_has_size_and_evidence() -> None:
+def test_noise_growing_with_load_has_size_and_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against the likelihoods of the same squares, counted here."""
     rng = np.random.default_rng(5)
     o = make_observation(6)
@@ -369,6 +350,13 @@ def test_noise_growing_with_load_has_size_and_evidence() -> None:
         fit = refit(ws, ())
         wider = [d * floors * ws.floor() / ws.gap(fit.difference) for d in fit.difference]
         assert (laws.find_jitter(ws, dataclasses.replace(fit, difference=wider), 3.0) is not None) is there
+    # By chance at most once in a hundred times, of all that was tried.
+    fit = refit(workspace, ())
+    most, _ = law_features.most_jitter(workspace, fit, {term.of[0]: [known]})
+    assert most is not None
+    for p, there in ((0.0099, True), (0.0101, False)):
+        monkeypatch.setattr(laws, 'most_jitter', lambda *_, p=p: ((60.0, *most[1:]), p / chi2_law.sf(60.0, 1)))
+        assert (laws.find_jitter(workspace, fit, 3.0) is not None) is there
 
 
 def test_a_law_shows_where_a_twentieth_of_its_energy_is(observed: tuple[Workspace, Fit]) -> None:

@@ -22,6 +22,8 @@ from psd_deflection.studies.discover import plant_search
 from psd_deflection.studies.discover.plant_search import PlantComparison, discover_in
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.screen import Score
+from psd_deflection.studies.discover.search.search import Search
 
 LENGTHS = (10, 7, 13)
 
@@ -504,3 +506,6 @@ def test_noise_of_a_plant_is_nothing_missing() -> None:
     assert discovery.floors == 0.0
     assert '(noise alone: not known)' in repr(discovery)
     assert 'no effect' in repr(discovery)
+    search = Search(PlantComparison(steel(0.0)), lambda *_: cast(Any, None))
+    for p, passes in ((0.0099, True), (0.0101, False)):
+        assert search.may_pass(Score(cast(Any, None), 1e3, 1, p, np.zeros(1))) is passes

@@ -472,9 +472,6 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
         discover(both)
     with pytest.raises(RecordingError, match='x: is of 3 PSDs, the rig of the search has 2'):
         discover(both[:1], TWO)
-
-
-def test_volts_of_wrong_number_of_psds_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
         Observation('x', SIX, make_observation(THREE).volts, PUSHES)
 

@@ -342,8 +342,10 @@ class Bounded(LinearPlant):
         return super().simulate(effects)
 
 
+# Of 0.44 and 0.4 the error falls by 8 % and by 4.5 %.
 @pytest.mark.parametrize(
-    ('size', 'remains', 'open_level'), [(0.5, True, False), (0.0, False, False), (0.0, False, True)]
+    ('size', 'remains', 'open_level'),
+    [(0.5, True, False), (0.44, True, False), (0.4, False, False), (0.0, False, False), (0.0, False, True)],
 )
 def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool, open_level: bool) -> None:
     """Small terms beside a named effect ten times the noise, of which one number is no amplitude."""

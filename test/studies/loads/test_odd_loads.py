@@ -201,17 +201,9 @@ def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: floa
         Hold(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, annotated, 0.0))) for i in range(len(more))
     )
     other = Hold(0, 2000 * len(more), 2000 * len(more) + 2000, 2, False, np.array((0.0, 20.0, 0.0)))
-    nothing = np.zeros((3, 0))
-    return ImpliedLoads(
-        (*listed, other),
-        np.vstack((rows, np.zeros((1, 3)))),
-        nothing,
-        nothing,
-        np.zeros(0),
-        np.array([across] * len(more) + [0.0]),
-        np.array((4e-5, 4e-5, 6e-5)),
-        4,
-    )
+    nothing, residual = np.zeros((3, 0)), np.array([across] * len(more) + [0.0])
+    implied, sd = np.vstack((rows, np.zeros((1, 3)))), np.array((4e-5, 4e-5, 6e-5))
+    return ImpliedLoads((*listed, other), implied, nothing, nothing, np.zeros(0), residual, sd, 4)
 
 
 def test_change_counts_above_three_times_allowed_effects() -> None:
@@ -224,9 +216,7 @@ def test_change_counts_above_three_times_allowed_effects() -> None:
     of = asked([0.0, 1.6, 0.0, 1.6], alone=1)
     known = [dataclasses.replace(p, annotated=np.zeros(3)) if i in (0, 4) else p for i, p in enumerate(of.holds)]
     assert unannotated_times(dataclasses.replace(of, holds=tuple(known)), 20_000, 0.001) == []
-
-
-def test_two_changes_are_too_few_and_noted_ones_do_not_count() -> None:
+    # Two changes are too few, and noted ones do not count.
     assert unannotated_times(asked([0.0, 9.0, 0.0], alone=1), 20_000, 0.001) == []
     assert unannotated_times(asked([0.0, 9.0, 0.0, 9.0], alone=2), 20_000, 0.001) == []
 
