@@ -6,8 +6,9 @@ parameter of its likelihood (N log RSS for each channel), and N counts correlati
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -23,6 +24,7 @@ from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.conclusion import Conclusion
 from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_tables, table_of
 from psd_deflection.studies.discover.problem import Machine, Progress
+from psd_deflection.studies.discover.rehearsal import simulated_plant
 from psd_deflection.studies.discover.report import sections
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, heldout_tables, refit
@@ -318,6 +320,10 @@ class PlantDiscovery(Conclusion):
     """
 
     workspace: PlantComparison
+
+    def search_in_simulation(self, seed: int) -> Callable[[], PlantDiscovery]:
+        """Return the same search in tables that the found model simulates; ``seed``: of their noise."""
+        return partial(discover_in, simulated_plant(self, seed), seed=self.seed)
 
     def sections(self) -> Iterable[PageSection]:
         """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""

@@ -117,7 +117,8 @@ def check_schema(tree: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
-    tree = rotated.tree()
+    tree = rotated.rehearse(2).tree()
+    assert (tree['rehearsal']['again'], tree['rehearsal']['failed']) == (2, 0)
     check_schema(tree)
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
 

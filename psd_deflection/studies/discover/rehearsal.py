@@ -1,0 +1,199 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""A measured confidence: the found model is simulated with the loads, gaps and noise of the recording, and the search
+runs again on each simulation. Every rehearsal has a noise of its own."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.model.simulation.catalogue import sort_effects
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.recordings.observation import Observation
+from psd_deflection.records import FloatArray, dot_channels
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, only_in
+from psd_deflection.studies.discover.noise import NoiseModel
+
+if TYPE_CHECKING:
+    from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
+    from psd_deflection.studies.discover.plant_search import PlantDiscovery
+    from psd_deflection.studies.discover.plants import Plant
+
+INTERVAL, LEAST_NOISE, COMPETING = 1.96, 0.1, SETUP | {'load_value', 'load_unit'}
+"""Standard deviations; share of the estimated noise that is simulated at least; mistakes that imitate effects."""
+
+
+class Named(NamedTuple):
+    """An effect or mistake; ``equivalent``: names of what explains the data as well; ``sd``: of the fitted values."""
+
+    name: str
+    label: str
+    equivalent: tuple[str, ...] = ()
+    values: Mapping[str, float] = {}
+    sd: Mapping[str, float] = {}
+
+
+UNKNOWN = Named('unknown effect', 'unknown effect')
+
+
+def named_by(answer: Conclusion) -> tuple[Named, ...]:
+    """Return what a search named: effects, mistakes that compete with them, and an unknown effect."""
+    effects = [Named(e.name, e.active.label, e.equivalent, e.values, e.sd) for e in answer.effects]
+    mistakes = {f.name: Named(f.name, f.name, f.equivalent) for f in answer.mistakes if f.name in COMPETING}
+    return (*effects, *mistakes.values(), *([UNKNOWN] if answer.unknown else []))
+
+
+class Outcome(NamedTuple):
+    """``named``: by one rehearsal. ``error``: why it ended early, '' if it did not."""
+
+    named: tuple[Named, ...] = ()
+    error: str = ''
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """``expected``: what the search of the recording named. ``outcomes``: of the rehearsals."""
+
+    expected: tuple[Named, ...]
+    outcomes: tuple[Outcome, ...]
+
+    def _pairs(self, outcome: Outcome) -> list[tuple[Named, Named]] | None:
+        """Return each expected effect with the rehearsed one; None if they are neither the same nor equivalent."""
+        # An unknown effect is not simulated; effects that were tied, and thus unknown, are tied again.
+        wanted = [n for n in self.expected if n != UNKNOWN]
+        again = [n for n in outcome.named if n != UNKNOWN or UNKNOWN not in self.expected]
+        if outcome.error or len(wanted) != len(again):
+            return None
+        cost = [[0.0 if a.label == b.label else 1.0 if b.name in a.equivalent else 9e9 for b in again] for a in wanted]
+        order = linear_sum_assignment(np.reshape(cost, (len(wanted), len(again))))
+        pairs = [(wanted[i], again[j]) for i, j in zip(*order, strict=True)]
+        return pairs if all(a.label == b.label or b.name in a.equivalent for a, b in pairs) else None
+
+    def tree(self) -> dict[str, Any]:
+        """Return the counts of result.json."""
+        matches = [p for o in self.outcomes if (p := self._pairs(o)) is not None]
+        pairs = [*itertools.chain(*matches)]
+        inside = [
+            abs(b.values[name] - a.values[name]) <= INTERVAL * sd
+            for a, b in pairs
+            for name, sd in b.sd.items()
+            if a.label == b.label and math.isfinite(a.values[name] + b.values[name])
+        ]
+        differing = (o for o in self.outcomes if not o.error and self._pairs(o) is None)
+        otherwise = Counter(tuple(sorted(n.label for n in o.named)) for o in differing)
+        return {
+            'times': len(self.outcomes),
+            'again': len(matches),
+            'by_equivalent': dict(Counter(b.label for a, b in pairs if a.label != b.label)),
+            'sizes': len(inside),
+            'sizes_in_interval': sum(inside),
+            'otherwise': [{'effects': [*labels], 'times': n} for labels, n in otherwise.most_common()],
+            'failed': sum(bool(o.error) for o in self.outcomes),
+        }
+
+    def sentences(self) -> list[str]:
+        """Return how often the search found its own answer again, and what it named instead."""
+        tree = self.tree()
+        again = f'without a missing effect: nothing missing in {tree["again"]} of {tree["times"]}'
+        if any(n != UNKNOWN for n in self.expected):
+            again = f'with the found effects: found again in {tree["again"]}'
+        if equivalents := [f'in {n} its equivalent {label}' for label, n in tree['by_equivalent'].items()]:
+            again += f' ({", ".join(equivalents)})'
+        words = [f'{_times(o["times"])} {" and ".join(o["effects"]) or "nothing"} instead' for o in tree['otherwise']]
+        if tree['failed']:
+            words.append(f'{_times(tree["failed"])} failed ({next(o.error for o in self.outcomes if o.error)})')
+        out = [f'Rehearsed {_times(tree["times"])} on simulated recordings {"; ".join([again, *words])}.']
+        if tree['sizes']:
+            out.append(f'{tree["sizes_in_interval"]} of {tree["sizes"]} sizes were within their 95 % intervals.')
+        return [*out, 'The simulated recordings lack what is unknown.'] if UNKNOWN in self.expected else out
+
+
+def _times(count: int) -> str:
+    return 'once' if count == 1 else f'{count} times'
+
+
+def attempted(search: Callable[[], Conclusion]) -> Outcome:
+    """Return the outcome of ``search``; an error that it raises is an outcome, too."""
+    try:
+        return Outcome(named_by(search()))
+    except Exception as error:
+        return Outcome(error=f'{type(error).__name__}: {error}')
+
+
+def rehearsals(answer: Conclusion, times: int) -> Iterator[Callable[[], Outcome]]:
+    """Return the rehearsals, one for each seed from 1 to ``times``; each runs when it is called, in any process.
+
+    Raises ConfigError if ``times`` is below 1.
+    """
+    if times < 1:
+        raise ConfigError(f'times = {times}: must be at least 1')
+    for seed in range(1, times + 1):
+        try:
+            yield partial(attempted, answer.search_in_simulation(seed))
+        except Exception as error:
+            yield partial(Outcome, (), f'{type(error).__name__}: {error}')
+
+
+def simulated_recordings(answer: RigConclusion, seed: int) -> list[Observation]:
+    """Return the recordings as the found model would have made them, with their wiring, annotations and gaps."""
+    rng, ws = np.random.default_rng(seed), answer.workspace
+    mistakes = [a for a in answer.fit.effects if a.effect.name in SETUP and a.effect.name not in RIG_NUMBERS]
+    effects = [*answer.known, *answer.fit.nuisance, *(e.active for e in answer.effects), *mistakes]
+    out = []
+    for i, (given, o, noise) in enumerate(zip(answer.recordings, ws.observations, ws.noise, strict=True)):
+        # The estimated noise contains that of the converter's steps, which the simulation adds.
+        variance = np.maximum(noise.sigma**2 - _steps(o, effects) ** 2 / 12.0, (LEAST_NOISE * noise.sigma) ** 2)
+        drawn = dataclasses.replace(noise, sigma=np.sqrt(variance)).draw(len(o.loads), o.period, rng)
+        simulator = RigSimulator(o.rig, effects=sort_effects(only_in(effects, i)))
+        counts = simulator.step(o.acting, o.temperature, drawn).counts
+        wiring = Wiring.from_rig(given.rig)
+        volts = wiring.to_psds(counts.astype(np.float64) * o.rig.converter.volts_per_count)
+        # Gaps of PSDs on another clock are elsewhere in the readings that are on one clock.
+        lost = given.volts if answer.late else wiring.to_psds(Wiring.from_rig(o.rig).to_device(o.volts))
+        out.append(dataclasses.replace(given, volts=np.where(np.isnan(lost), np.nan, volts), digest=''))
+    return out
+
+
+def _steps(o: Observation, effects: Sequence[ActiveEffect]) -> FloatArray:
+    """Return the steps (3P,) V of the readings: the converter's, or coarser ones of an effect."""
+    steps = np.full(3 * o.psds, o.rig.converter.volts_per_count)
+    for a in effects:
+        if a.effect.value_grid:
+            steps[slice(None) if a.effect.steps_sums(a.values) else [*dot_channels(o.psds)]] = a.values[
+                a.effect.value_grid
+            ]
+    return steps
+
+
+def simulated_plant(answer: PlantDiscovery, seed: int) -> Plant:
+    """Return the plant with what its found model would have measured: noise as stated, else as it remains."""
+    rng, ws, fit = np.random.default_rng(seed), answer.workspace, answer.fit
+    freedom = np.maximum(ws.independent - len(fit.free) / len(ws.channels), 1.0)
+    level = np.where(ws.known > 0.0, ws.known, ws.gap_per_channel(fit.difference) * np.sqrt(ws.independent / freedom))
+    # With the correlation time of what remains.
+    apart = np.maximum(ws.total, 1) / ws.independent if ws.plant.period > 0.0 else np.ones(len(level))
+    memory = (np.maximum(apart - 1.0, 0.0) / (apart + 1.0))[:, None]
+    noise = NoiseModel(level, 0.0 * memory, level, level, 0.0, (), None, memory)
+    simulated = ws.simulate([*ws.base, *fit.coefficients_with_nuisance])
+    tables = [
+        # A channel that the model simulates to the last digit is no measurement.
+        np.where(there, s + noise.draw(s.shape[1], ws.plant.period, rng).T, np.where(ws.total[:, None], np.nan, given))
+        for given, s, there in zip(ws.plant.measured(), simulated, ws.there, strict=True)
+    ]
+    plant = copy.copy(ws.plant)
+    vars(plant)['measured'] = partial(list, tables)
+    return plant
