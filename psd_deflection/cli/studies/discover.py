@@ -46,7 +46,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -86,7 +86,6 @@ from psd_deflection.studies.discover.rehearsal import Outcome, rehearsals
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 
-C = TypeVar('C', bound=Conclusion)
 _NEXT_HELP = """\
 limits of --next (--limit NAME=VALUE), with what holds if they are not given:
   force=50         largest force, N
@@ -329,8 +328,8 @@ def _in_csv(args: argparse.Namespace) -> int:
 def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
     if args.recordings:
         raise UsageError(f'{args.recordings[0]}: --isolable {args.isolable} needs no recording')
-    needing = {'adopt': None, 'each': False, 'next': False, 'make_it': False, 'namespace': None, 'rehearse': None}
-    reject(args, needing, 'needs a REC')
+    reject(args, dict.fromkeys(('each', 'next', 'make_it'), False), 'needs a REC')
+    reject(args, dict.fromkeys(('adopt', 'namespace', 'rehearse')), 'needs a REC')
     if args.span != FULL:
         raise UsageError('--from, --to: need a REC')
     rig = asked.rig() or load_rig()
@@ -393,11 +392,11 @@ def _searched(
     return planned(discovery, limits) if args.next else discovery
 
 
-def _rehearsed(args: argparse.Namespace, answer: C) -> C:
-    """``answer`` with its rehearsals: after Ctrl-C, with those that had ended."""
-    tasks, outcomes = rehearsals(answer, args.rehearse), list[Outcome]()
-    hidden = True if args.quiet or args.json else None
-    with tqdm(total=args.rehearse, unit=' rehearsals', leave=False, disable=hidden, file=sys.stderr, ncols=80) as bar:
+def _rehearsed(args: argparse.Namespace, answer: Conclusion | LoopResult) -> Conclusion | LoopResult:
+    """``answer``, which is on the disk already, with its rehearsals: after Ctrl-C, with those that had ended."""
+    tasks = rehearsals(answer.discovery if isinstance(answer, LoopResult) else answer, args.rehearse)
+    outcomes: list[Outcome] = []
+    with tqdm(total=args.rehearse, unit=' rehearsals', leave=False, disable=args.quiet or args.json or None) as bar:
         try:
             for outcome in FLEET.results_of(tasks, args.executor) if args.executor else (task() for task in tasks):
                 outcomes.append(outcome)
@@ -409,12 +408,8 @@ def _rehearsed(args: argparse.Namespace, answer: C) -> C:
 
 def _answered(args: argparse.Namespace, answer: StudyResult, files: Mapping[str, str], hints: Sequence[str]) -> int:
     save_all(files, Path(args.out))
-    if args.rehearse is not None:
-        # Whatever ends a rehearsal, the answer is on the disk.
-        if isinstance(answer, LoopResult):
-            answer = dataclasses.replace(answer, discovery=_rehearsed(args, answer.discovery))
-        elif isinstance(answer, Conclusion):
-            answer = _rehearsed(args, answer)
+    if args.rehearse is not None and isinstance(answer, Conclusion | LoopResult):
+        answer = _rehearsed(args, answer)
         for name, text in answer.files().items():
             save(text.encode(errors='replace'), Path(args.out) / name)
     print_answer(args, answer)
@@ -469,8 +464,7 @@ def answer_of(path: str, asked: DiscoverOptions, rehearse: int | None = None) ->
     """The task for one of many recordings, with so many rehearsals; its TaskResult."""
     warnings: list[str] = []
     discovery = asked.discovered(asked.read([path], warnings.append), notify=warnings.append)
-    if rehearse is not None:
-        discovery = discovery.rehearse(rehearse)
+    discovery = discovery.rehearse(rehearse) if rehearse else discovery
     files = discovery.files()
     cells: dict[str, object] = {
         'verdict': discovery.verdict,

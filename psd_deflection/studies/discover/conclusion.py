@@ -31,16 +31,10 @@ from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
+from psd_deflection.studies.discover import rehearsal as rehearsing
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP
 from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.redundant import STAGES
-from psd_deflection.studies.discover.rehearsal import (
-    Outcome,
-    Rehearsal,
-    named_by,
-    rehearsals,
-    simulated_recordings,
-)
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import Localisation
@@ -98,27 +92,21 @@ class Conclusion(StudyResult):
     workspace: Comparison
     seed: int
     nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
-    rehearsal: Rehearsal | None = field(default=None, kw_only=True)
+    rehearsal: rehearsing.Rehearsal | None = field(default=None, kw_only=True)
 
     def rehearse(self, times: int) -> Self:
-        """Return the answer with a measured confidence: ``times`` searches in simulations of the found model.
-
-        The simulations have the loads, gaps and noise of what was measured. Raises ConfigError if ``times`` is below 1.
+        """Return the answer with a measured confidence: ``times`` searches in simulations of the found model, with the
+        loads, gaps and noise of what was measured. Raises ConfigError if ``times`` is below 1.
         """
-        return self.rehearsed([run() for run in rehearsals(self, times)])
+        return self.rehearsed([run() for run in rehearsing.rehearsals(self, times)])
 
-    def rehearsed(self, outcomes: Sequence[Outcome]) -> Self:
+    def rehearsed(self, outcomes: Sequence[rehearsing.Outcome]) -> Self:
         """Return the answer with the ``outcomes`` of its rehearsals."""
-        return replace(self, rehearsal=Rehearsal(named_by(self), tuple(outcomes)))
+        return replace(self, rehearsal=rehearsing.Rehearsal(rehearsing.named_by(self), tuple(outcomes)))
 
     @abc.abstractmethod
     def search_in_simulation(self, seed: int) -> Callable[[], Conclusion]:
         """Return the same search in a simulation of the found model; ``seed``: of its noise."""
-
-    @property
-    def mistakes(self) -> tuple[Finding, ...]:
-        """Mistakes of the set-up; a machine that simulates itself has none."""
-        return ()
 
     @property
     def floors(self) -> float:
@@ -146,12 +134,8 @@ class Conclusion(StudyResult):
 
     def sentences(self) -> list[str]:
         """What is missing, or that nothing is, and which effects may have one cause."""
-        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.small_terms, *self.rehearsed_words]
-
-    @property
-    def rehearsed_words(self) -> list[str]:
-        """The outcome of the rehearsals in sentences; none if there was no rehearsal."""
-        return [] if self.rehearsal is None else self.rehearsal.sentences()
+        rehearsed = [] if self.rehearsal is None else self.rehearsal.sentences()
+        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.small_terms, *rehearsed]
 
     @property
     def unexplained(self) -> bool:
@@ -293,24 +277,17 @@ class RigConclusion(Conclusion):
     unsettled: tuple[str, ...]
     moves: tuple[float, float, float]
     rig: Rig
+    recordings: tuple[Observation, ...]
+    search_again: Callable[[Sequence[Observation]], Conclusion]
     params_file: str | Path | None = None
     adopted: str = ''
     notify: Notify = warn_caller
     late: tuple[str, ...] = ()
     rig_source: str = GIVEN_RIG
-    recordings: tuple[Observation, ...] = ()
-    search_again: Callable[[Sequence[Observation]], Conclusion] | None = None
 
     def search_in_simulation(self, seed: int) -> Callable[[], Conclusion]:
         """Return the same search in simulated recordings of the found model; ``seed``: of their noise."""
-        if self.search_again is None:
-            raise ConfigError('rehearse: the answer is of no search of recordings')
-        return partial(self.search_again, simulated_recordings(self, seed))
-
-    @property
-    def mistakes(self) -> tuple[Finding, ...]:
-        """Mistakes of the set-up."""
-        return self.setup
+        return partial(self.search_again, rehearsing.simulated_recordings(self, seed))
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -345,7 +322,7 @@ class RigConclusion(Conclusion):
         tied = [t.sentence for t in ties(self.effects)]
         annotated = _as_annotated(self)
         words = (setup, missing, *tied, annotated, _moved(self), law_sentence(self), *self.small_terms)
-        return [*filter(None, words), *self.rehearsed_words]
+        return [*filter(None, words), *([] if self.rehearsal is None else self.rehearsal.sentences())]
 
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""

@@ -124,8 +124,6 @@ LEAST_REST = 400
 MOVING = 10.0
 """Coloured noise is at most so many times what neighbouring samples show; beyond, what is taken for rest moves."""
 
-SETTLED = 1000
-"""Samples after which simulated noise has forgotten its start."""
 ALIKE = 0.2
 """Share by which corners of slow noise may differ."""
 
@@ -147,12 +145,12 @@ class NoiseModel:
     sample_ar: FloatArray | None = None
 
     def draw(self, n: int, period: float, rng: np.random.Generator) -> FloatArray:
-        """Return noise (n, 3P) V of this level, memory and slow part; ``period``: s between samples."""
-        rows = rng.standard_normal((len(self.sigma), SETTLED + n))
+        """Return such noise (n, 3P) V, ``period`` s between samples; 1000 values before these settle the memory."""
+        rows = rng.standard_normal((len(self.sigma), n + 1000))
         for row, phi in zip(rows, () if self.sample_ar is None else self.sample_ar, strict=False):
             density = _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
             row[:] = lfilter([1.0 / np.sqrt(density.mean())], [1.0, *-phi], row)
-        rows = self.sigma[:, None] * rows[:, SETTLED:]
+        rows = self.sigma[:, None] * rows[:, 1000:]
         return (rows if self.slow is None else SlowNoise.of(self.corners, n, period).unwhiten(rows)).T
 
     def with_slow_noise(self, corners: FloatArray, n: int, period: float, block: float) -> NoiseModel:

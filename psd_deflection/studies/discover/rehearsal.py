@@ -53,8 +53,9 @@ UNKNOWN = Named('unknown effect', 'unknown effect')
 def named_by(answer: Conclusion) -> tuple[Named, ...]:
     """Return what a search named: effects, mistakes that compete with them, and an unknown effect."""
     effects = [Named(e.name, e.active.label, e.equivalent, e.values, e.sd) for e in answer.effects]
-    mistakes = {f.name: Named(f.name, f.name, f.equivalent) for f in answer.mistakes if f.name in COMPETING}
-    return (*effects, *mistakes.values(), *([UNKNOWN] if answer.unknown else []))
+    setup = {f.name: f for f in getattr(answer, 'setup', ()) if f.name in COMPETING}
+    mistakes = [Named(name, name, f.equivalent) for name, f in setup.items()]
+    return (*effects, *mistakes, *([UNKNOWN] if answer.unknown else []))
 
 
 class Outcome(NamedTuple):
@@ -93,8 +94,8 @@ class Rehearsal:
             for name, sd in b.sd.items()
             if a.label == b.label and math.isfinite(a.values[name] + b.values[name])
         ]
-        differing = (o for o in self.outcomes if not o.error and self._pairs(o) is None)
-        otherwise = Counter(tuple(sorted(n.label for n in o.named)) for o in differing)
+        differing = (o.named for o in self.outcomes if not o.error and self._pairs(o) is None)
+        otherwise = Counter(tuple(sorted(n.label for n in named)) for named in differing)
         return {
             'times': len(self.outcomes),
             'again': len(matches),
@@ -135,10 +136,7 @@ def attempted(search: Callable[[], Conclusion]) -> Outcome:
 
 
 def rehearsals(answer: Conclusion, times: int) -> Iterator[Callable[[], Outcome]]:
-    """Return the rehearsals, one for each seed from 1 to ``times``; each runs when it is called, in any process.
-
-    Raises ConfigError if ``times`` is below 1.
-    """
+    """Yield the rehearsals of the seeds 1 to ``times``, which run when called. Raises ConfigError below 1."""
     if times < 1:
         raise ConfigError(f'times = {times}: must be at least 1')
     for seed in range(1, times + 1):

@@ -313,7 +313,7 @@ def _rehearsed(discovery: Conclusion) -> list[str]:
         return []
     tree = discovery.rehearsal.tree()
     rows = [('the same', tree['again']), *((', '.join(o['effects']), o['times']) for o in tree['otherwise'])]
-    return [f'<p>{html.escape(" ".join(discovery.rehearsed_words))}</p>', table(('named by', 'rehearsals'), rows)]
+    return [f'<p>{html.escape(discovery.rehearsal.sentences()[0])}</p>', table(('named by', 'rehearsals'), rows)]
 
 
 def _unknown(u: Unknown) -> str:
