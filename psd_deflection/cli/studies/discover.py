@@ -82,7 +82,7 @@ from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LISTED, SCRIPT, LoopResult, planned, recorded_name, run_loop
 from psd_deflection.studies.discover.planning import Plan
-from psd_deflection.studies.discover.rehearsal import Outcome, rehearsals
+from psd_deflection.studies.discover.rehearsal import RehearsalOutcome, rehearsals
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 
@@ -395,7 +395,7 @@ def _searched(
 def _rehearsed(args: argparse.Namespace, answer: Conclusion | LoopResult) -> Conclusion | LoopResult:
     """``answer``, which is on the disk already, with its rehearsals: after Ctrl-C, with those that had ended."""
     tasks = rehearsals(answer.discovery if isinstance(answer, LoopResult) else answer, args.rehearse)
-    outcomes: list[Outcome] = []
+    outcomes: list[RehearsalOutcome] = []
     with tqdm(total=args.rehearse, unit=' rehearsals', leave=False, disable=args.quiet or args.json or None) as bar:
         try:
             for outcome in FLEET.results_of(tasks, args.executor) if args.executor else (task() for task in tasks):

@@ -100,7 +100,7 @@ class Conclusion(StudyResult):
         """
         return self.rehearsed([run() for run in rehearsing.rehearsals(self, times)])
 
-    def rehearsed(self, outcomes: Sequence[rehearsing.Outcome]) -> Self:
+    def rehearsed(self, outcomes: Sequence[rehearsing.RehearsalOutcome]) -> Self:
         """Return the answer with the ``outcomes`` of its rehearsals."""
         return replace(self, rehearsal=rehearsing.Rehearsal(rehearsing.named_by(self), tuple(outcomes)))
 

@@ -14,7 +14,7 @@ from psd_deflection.base.tables import Table
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.planning import Plan, plan_next
-from psd_deflection.studies.discover.rehearsal import Outcome as RehearsalOutcome
+from psd_deflection.studies.discover.rehearsal import RehearsalOutcome
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import PageSection, StudyResult
 

@@ -58,7 +58,7 @@ def named_by(answer: Conclusion) -> tuple[Named, ...]:
     return (*effects, *mistakes, *([UNKNOWN] if answer.unknown else []))
 
 
-class Outcome(NamedTuple):
+class RehearsalOutcome(NamedTuple):
     """``named``: by one rehearsal. ``error``: why it ended early, '' if it did not."""
 
     named: tuple[Named, ...] = ()
@@ -70,9 +70,9 @@ class Rehearsal:
     """``expected``: what the search of the recording named. ``outcomes``: of the rehearsals."""
 
     expected: tuple[Named, ...]
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[RehearsalOutcome, ...]
 
-    def _pairs(self, outcome: Outcome) -> list[tuple[Named, Named]] | None:
+    def _pairs(self, outcome: RehearsalOutcome) -> list[tuple[Named, Named]] | None:
         """Return each expected effect with the rehearsed one; None if they are neither the same nor equivalent."""
         # An unknown effect is not simulated; effects that were tied, and thus unknown, are tied again.
         wanted = [n for n in self.expected if n != UNKNOWN]
@@ -127,15 +127,15 @@ def _times(count: int) -> str:
     return 'once' if count == 1 else f'{count} times'
 
 
-def attempted(search: Callable[[], Conclusion]) -> Outcome:
+def attempted(search: Callable[[], Conclusion]) -> RehearsalOutcome:
     """Return the outcome of ``search``; an error that it raises is an outcome, too."""
     try:
-        return Outcome(named_by(search()))
+        return RehearsalOutcome(named_by(search()))
     except Exception as error:
-        return Outcome(error=f'{type(error).__name__}: {error}')
+        return RehearsalOutcome(error=f'{type(error).__name__}: {error}')
 
 
-def rehearsals(answer: Conclusion, times: int) -> Iterator[Callable[[], Outcome]]:
+def rehearsals(answer: Conclusion, times: int) -> Iterator[Callable[[], RehearsalOutcome]]:
     """Yield the rehearsals of the seeds 1 to ``times``, which run when called. Raises ConfigError below 1."""
     if times < 1:
         raise ConfigError(f'times = {times}: must be at least 1')
@@ -143,7 +143,7 @@ def rehearsals(answer: Conclusion, times: int) -> Iterator[Callable[[], Outcome]
         try:
             yield partial(attempted, answer.search_in_simulation(seed))
         except Exception as error:
-            yield partial(Outcome, (), f'{type(error).__name__}: {error}')
+            yield partial(RehearsalOutcome, (), f'{type(error).__name__}: {error}')
 
 
 def simulated_recordings(answer: RigConclusion, seed: int) -> list[Observation]:

@@ -21,7 +21,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover import plant_search
 from psd_deflection.studies.discover.plant_search import PlantComparison, discover_in
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
-from psd_deflection.studies.discover.rehearsal import UNKNOWN, Named, Outcome, Rehearsal
+from psd_deflection.studies.discover.rehearsal import UNKNOWN, Named, Rehearsal, RehearsalOutcome
 from psd_deflection.studies.discover.search.fit import refit
 
 LENGTHS = (10, 7, 13)
@@ -539,7 +539,7 @@ def test_rehearsal_counts_what_is_named_and_sizes_inside() -> None:
     inside, outside = gain._replace(values={'x': 1.19}), skew._replace(values={'x': 0.8})
     lag = inside._replace(name='lag', label='lag (psd 2)')
     named = [(outside, inside), (skew, lag), (lag, gain), (gain, skew, UNKNOWN), (gain,), (gain,)]
-    outcomes = (*map(Outcome, named), Outcome(error='ValueError: late'))
+    outcomes = (*map(RehearsalOutcome, named), RehearsalOutcome(error='ValueError: late'))
     rehearsal = Rehearsal((gain, skew), outcomes)
     tree = rehearsal.tree()
     assert (tree['again'], tree['by_equivalent']) == (2, {'lag (psd 2)': 1})
