@@ -394,8 +394,8 @@ def _searched(
 
 def _rehearsed(args: argparse.Namespace, answer: Conclusion | LoopResult) -> Conclusion | LoopResult:
     """``answer``, which is on the disk already, with its rehearsals: after Ctrl-C, with those that had ended."""
-    tasks = rehearsals(answer.discovery if isinstance(answer, LoopResult) else answer, args.rehearse)
-    outcomes: list[RehearsalOutcome] = []
+    discovery: Any = answer.discovery if isinstance(answer, LoopResult) else answer
+    tasks, outcomes = rehearsals(discovery, args.rehearse), list[RehearsalOutcome]()
     with tqdm(total=args.rehearse, unit=' rehearsals', leave=False, disable=args.quiet or args.json or None) as bar:
         try:
             for outcome in FLEET.results_of(tasks, args.executor) if args.executor else (task() for task in tasks):
@@ -403,7 +403,8 @@ def _rehearsed(args: argparse.Namespace, answer: Conclusion | LoopResult) -> Con
                 bar.update()
         except KeyboardInterrupt:
             warn(Note(f'--rehearse {args.rehearse}: interrupted after {len(outcomes)}; the answer is complete'))
-    return answer.rehearsed(outcomes) if outcomes else answer
+    discovery = discovery.rehearsed(outcomes) if outcomes else discovery
+    return dataclasses.replace(answer, discovery=discovery) if isinstance(answer, LoopResult) else discovery
 
 
 def _answered(args: argparse.Namespace, answer: StudyResult, files: Mapping[str, str], hints: Sequence[str]) -> int:

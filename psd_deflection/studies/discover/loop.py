@@ -14,7 +14,6 @@ from psd_deflection.base.tables import Table
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.planning import Plan, plan_next
-from psd_deflection.studies.discover.rehearsal import RehearsalOutcome
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import PageSection, StudyResult
 
@@ -91,10 +90,6 @@ class LoopResult(StudyResult):
     def adopt(self, name: str) -> LoopResult:
         """See :meth:`Discovery.adopt`."""
         return replace(self, discovery=self.discovery.adopt(name))
-
-    def rehearsed(self, outcomes: Sequence[RehearsalOutcome]) -> LoopResult:
-        """See :meth:`Discovery.rehearsed`."""
-        return replace(self, discovery=self.discovery.rehearsed(outcomes))
 
     def files(self) -> dict[str, str]:
         """Those of the answer; the list for the next search, and the loads that are planned."""

@@ -11,7 +11,6 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,10 +22,11 @@ from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.observation import Observation
-from psd_deflection.records import FloatArray, dot_channels
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, only_in
 from psd_deflection.studies.discover.noise import NoiseModel
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 if TYPE_CHECKING:
     from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
@@ -53,9 +53,9 @@ UNKNOWN = Named('unknown effect', 'unknown effect')
 def named_by(answer: Conclusion) -> tuple[Named, ...]:
     """Return what a search named: effects, mistakes that compete with them, and an unknown effect."""
     effects = [Named(e.name, e.active.label, e.equivalent, e.values, e.sd) for e in answer.effects]
-    setup = {f.name: f for f in getattr(answer, 'setup', ()) if f.name in COMPETING}
-    mistakes = [Named(name, name, f.equivalent) for name, f in setup.items()]
-    return (*effects, *mistakes, *([UNKNOWN] if answer.unknown else []))
+    competing = [f for f in getattr(answer, 'setup', ()) if f.name in COMPETING]
+    mistakes = {f.name: Named(f.name, f.name, f.equivalent) for f in competing}
+    return (*effects, *mistakes.values(), *([UNKNOWN] if answer.unknown else []))
 
 
 class RehearsalOutcome(NamedTuple):
@@ -65,7 +65,7 @@ class RehearsalOutcome(NamedTuple):
     error: str = ''
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Rehearsal:
     """``expected``: what the search of the recording named. ``outcomes``: of the rehearsals."""
 
@@ -148,41 +148,44 @@ def rehearsals(answer: Conclusion, times: int) -> Iterator[Callable[[], Rehearsa
 
 def simulated_recordings(answer: RigConclusion, seed: int) -> list[Observation]:
     """Return the recordings as the found model would have made them, with their wiring, annotations and gaps."""
-    rng, ws = np.random.default_rng(seed), answer.workspace
     mistakes = [a for a in answer.fit.effects if a.effect.name in SETUP and a.effect.name not in RIG_NUMBERS]
     effects = [*answer.known, *answer.fit.nuisance, *(e.active for e in answer.effects), *mistakes]
+    ws = answer.workspace
+    volts = _simulated(ws, ws.noise, effects, seed)
+    right = [dataclasses.replace(o, volts=v) for o, v in zip(ws.observations, volts, strict=True)]
+    if any(n.slow for n in ws.noise) and not any(n.slow for n in Workspace(right, effects).noise):
+        # Slow noise that its own estimate does not find is that of a memory which the estimate cannot describe.
+        volts = _simulated(ws, [dataclasses.replace(n, slow=None) for n in ws.noise], effects, seed)
     out = []
-    for i, (given, o, noise) in enumerate(zip(answer.recordings, ws.observations, ws.noise, strict=True)):
-        # The estimated noise contains that of the converter's steps, which the simulation adds.
-        variance = np.maximum(noise.sigma**2 - _steps(o, effects) ** 2 / 12.0, (LEAST_NOISE * noise.sigma) ** 2)
-        drawn = dataclasses.replace(noise, sigma=np.sqrt(variance)).draw(len(o.loads), o.period, rng)
-        simulator = RigSimulator(o.rig, effects=sort_effects(only_in(effects, i)))
-        counts = simulator.step(o.acting, o.temperature, drawn).counts
-        wiring = Wiring.from_rig(given.rig)
-        volts = wiring.to_psds(counts.astype(np.float64) * o.rig.converter.volts_per_count)
+    for given, o, simulated in zip(answer.recordings, ws.observations, volts, strict=True):
+        wiring, corrected = Wiring.from_rig(given.rig), Wiring.from_rig(o.rig)
         # Gaps of PSDs on another clock are elsewhere in the readings that are on one clock.
-        lost = given.volts if answer.late else wiring.to_psds(Wiring.from_rig(o.rig).to_device(o.volts))
-        out.append(dataclasses.replace(given, volts=np.where(np.isnan(lost), np.nan, volts), digest=''))
+        lost = np.isnan(given.volts if answer.late else wiring.to_psds(corrected.to_device(o.volts)))
+        rewired = wiring.to_psds(corrected.to_device(simulated))
+        out.append(dataclasses.replace(given, volts=np.where(lost, np.nan, rewired), digest=''))
     return out
 
 
-def _steps(o: Observation, effects: Sequence[ActiveEffect]) -> FloatArray:
-    """Return the steps (3P,) V of the readings: the converter's, or coarser ones of an effect."""
-    steps = np.full(3 * o.psds, o.rig.converter.volts_per_count)
-    for a in effects:
-        if a.effect.value_grid:
-            steps[slice(None) if a.effect.steps_sums(a.values) else [*dot_channels(o.psds)]] = a.values[
-                a.effect.value_grid
-            ]
-    return steps
+def _simulated(ws: Workspace, noises: Sequence[NoiseModel], effects: list[ActiveEffect], seed: int) -> list[FloatArray]:
+    rng, out = np.random.default_rng(seed), []
+    for i, (o, noise) in enumerate(zip(ws.observations, noises, strict=True)):
+        steps = np.full(3 * o.psds, o.rig.converter.volts_per_count)
+        for a in (a for a in effects if a.effect.value_grid):
+            steps[[True, True, a.effect.steps_sums(a.values)] * o.psds] = a.values[a.effect.value_grid]
+        # The estimated noise contains that of the steps, which the simulation adds.
+        variance = np.maximum(noise.sigma**2 - steps**2 / 12.0, (LEAST_NOISE * noise.sigma) ** 2)
+        drawn = dataclasses.replace(noise, sigma=np.sqrt(variance)).draw(len(o.loads), o.period, rng)
+        simulator = RigSimulator(o.rig, effects=sort_effects(only_in(effects, i)))
+        counts = simulator.step(o.acting, o.temperature, drawn).counts.astype(np.float64)
+        out.append(Wiring.from_rig(o.rig).to_psds(counts * o.rig.converter.volts_per_count))
+    return out
 
 
 def simulated_plant(answer: PlantDiscovery, seed: int) -> Plant:
-    """Return the plant with what its found model would have measured: noise as stated, else as it remains."""
+    """Return the plant with what its found model would have measured: noise as stated, else as what remains."""
     rng, ws, fit = np.random.default_rng(seed), answer.workspace, answer.fit
     freedom = np.maximum(ws.independent - len(fit.free) / len(ws.channels), 1.0)
     level = np.where(ws.known > 0.0, ws.known, ws.gap_per_channel(fit.difference) * np.sqrt(ws.independent / freedom))
-    # With the correlation time of what remains.
     apart = np.maximum(ws.total, 1) / ws.independent if ws.plant.period > 0.0 else np.ones(len(level))
     memory = (np.maximum(apart - 1.0, 0.0) / (apart + 1.0))[:, None]
     noise = NoiseModel(level, 0.0 * memory, level, level, 0.0, (), None, memory)
