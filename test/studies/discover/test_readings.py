@@ -29,6 +29,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import differences, fix_of, parameters
 from psd_deflection.studies.discover import plant_search
 from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.noise import SlowNoise
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.plants import CHANNELS, Plant, Readings, ReadingsPlant
 from psd_deflection.studies.discover.readings import read_tables
@@ -376,6 +377,10 @@ def test_simulated_recordings_have_wiring_gaps_and_noise() -> None:
         np.testing.assert_array_equal(np.isnan(first.volts), np.isnan(other.volts))
         sd = np.nanstd(first.volts - other.volts, axis=0)
         assert sd == pytest.approx(math.sqrt(2.0) * ws.noise[0].sigma, rel=0.05)
+    for corner, observed in ((0.01, False), (20.0, True)):
+        noise = dataclasses.replace(ws.noise[0], slow=SlowNoise.of(np.full(6, corner), 10, 1e-3))
+        answer.workspace = ws.replaced(noise=(noise,))
+        assert np.array_equal(simulated_recordings(cast(Any, answer), 1)[0].volts, first.volts, True) is not observed
 
 
 @pytest.mark.slow
