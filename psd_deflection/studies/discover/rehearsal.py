@@ -5,7 +5,6 @@ runs again on each simulation. Every rehearsal has a noise of its own."""
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
 import math
@@ -30,8 +29,6 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 
 if TYPE_CHECKING:
     from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
-    from psd_deflection.studies.discover.plant_search import PlantDiscovery
-    from psd_deflection.studies.discover.plants import Plant
 
 INTERVAL, LEAST_NOISE, COMPETING = 1.96, 0.1, SETUP | {'load_value', 'load_unit'}
 """Standard deviations; share of the estimated noise that is simulated at least; mistakes that imitate effects."""
@@ -179,22 +176,3 @@ def _simulated(ws: Workspace, noises: Sequence[NoiseModel], effects: list[Active
         counts = simulator.step(o.acting, o.temperature, drawn).counts.astype(np.float64)
         out.append(Wiring.from_rig(o.rig).to_psds(counts * o.rig.converter.volts_per_count))
     return out
-
-
-def simulated_plant(answer: PlantDiscovery, seed: int) -> Plant:
-    """Return the plant with what its found model would have measured: noise as stated, else as what remains."""
-    rng, ws, fit = np.random.default_rng(seed), answer.workspace, answer.fit
-    freedom = np.maximum(ws.independent - len(fit.free) / len(ws.channels), 1.0)
-    level = np.where(ws.known > 0.0, ws.known, ws.gap_per_channel(fit.difference) * np.sqrt(ws.independent / freedom))
-    apart = np.maximum(ws.total, 1) / ws.independent if ws.plant.period > 0.0 else np.ones(len(level))
-    memory = (np.maximum(apart - 1.0, 0.0) / (apart + 1.0))[:, None]
-    noise = NoiseModel(level, 0.0 * memory, level, level, 0.0, (), None, memory)
-    simulated = ws.simulate([*ws.base, *fit.coefficients_with_nuisance])
-    tables = [
-        # A channel that the model simulates to the last digit is no measurement.
-        np.where(there, s + noise.draw(s.shape[1], ws.plant.period, rng).T, np.where(ws.total[:, None], np.nan, given))
-        for given, s, there in zip(ws.plant.measured(), simulated, ws.there, strict=True)
-    ]
-    plant = copy.copy(ws.plant)
-    vars(plant)['measured'] = partial(list, tables)
-    return plant
