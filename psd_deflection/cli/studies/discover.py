@@ -247,7 +247,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         type=integer('--rehearse', 1, 10_000),
         help='measure the confidence: simulate what was found N times, with the loads, gaps and noise of REC, and '
-        'search each simulation; the answer reports how often it was found again (10 take as long as 10 searches)',
+        'search each simulation; the answer reports how often it was found again (N searches; --executor shares them)',
     )
     parser.add_argument(
         '--isolable', metavar='LOADS', help='without REC: which effects a recording under these loads could tell apart'
