@@ -280,7 +280,7 @@ ARM = (
 
 
 class TwoLinkArm(Plant):
-    """Stage 1 of a flexible arm under its controller. Its maker's model lacks Coulomb friction and damping of the tip."""
+    """Stage 1 of a flexible arm. Its maker's model lacks Coulomb friction and damping of the tip."""
 
     channels = ('hub', 'tip')
     units = ('rad', 'rad')

@@ -5,7 +5,7 @@
 import argparse
 import contextlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -57,7 +57,7 @@ def each_for_itself(args: argparse.Namespace) -> list[str] | None:
     """The recordings by absolute path with --each, else None. Raises UsageError and RecordingError."""
     if args.each:
         return _paths(args.recordings)
-    if args.executor is not None:
+    if args.executor is not None and not getattr(args, 'rehearse', None):
         raise UsageError(f'--executor {args.executor}: needs --each; without it all recordings are one task')
     if is_parquet(args.out):
         raise UsageError(f'--out {args.out}: needs --each; without it there is one answer, and DIR is a folder')
@@ -91,6 +91,13 @@ def run_each(
         for outcome in outcomes(work, names, engine, bar.update):
             _take(outcome, take, failed)
     return failed
+
+
+def results_of(tasks: Iterable[Callable[[], T]], executor: str) -> Iterator[T]:
+    """The results of ``tasks`` that are no recordings, in their order, with the engine of --executor."""
+    with open_engine(executor, warn) as engine:
+        for future in [engine.submit(task) for task in tasks]:
+            yield future.result()
 
 
 def _take(outcome: Outcome[T], take: Callable[[str, T], None], failed: dict[str, str]) -> None:

@@ -52,6 +52,7 @@ from tqdm import tqdm
 
 from psd_deflection import discover_in
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.base.log import Note
 from psd_deflection.base.text import plain_number
 from psd_deflection.cli._many import FLEET, absolute, each_for_itself, each_option
 from psd_deflection.cli._options import (
@@ -63,7 +64,7 @@ from psd_deflection.cli._options import (
     world_option,
 )
 from psd_deflection.cli._progress import stage
-from psd_deflection.cli._report import save_all, show, warn
+from psd_deflection.cli._report import save, save_all, show, warn
 from psd_deflection.cli._values import given_as_option, integer, seed
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names, with_effects
@@ -75,12 +76,13 @@ from psd_deflection.recordings.spans import FULL
 from psd_deflection.recordings.write.parquet import ERROR, Field
 from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.discover.conclusion import adopting_folder
+from psd_deflection.studies.discover.conclusion import Conclusion, adopting_folder
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import LISTED, SCRIPT, LoopResult, planned, recorded_name, run_loop
 from psd_deflection.studies.discover.planning import Plan
+from psd_deflection.studies.discover.rehearsal import RehearsalOutcome, rehearsals
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.study import StudyResult
 
@@ -241,6 +243,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--without', metavar='EFFECT', action='append', default=[], help='do not consider this effect; repeatable'
     )
     parser.add_argument(
+        '--rehearse',
+        metavar='N',
+        type=integer('--rehearse', 1, 10_000),
+        help='measure the confidence: simulate what was found N times, with the loads, gaps and noise of REC, and '
+        'search each simulation; the answer reports how often it was found again (N searches; --executor shares them)',
+    )
+    parser.add_argument(
         '--isolable', metavar='LOADS', help='without REC: which effects a recording under these loads could tell apart'
     )
     parser.add_argument(
@@ -319,7 +328,8 @@ def _in_csv(args: argparse.Namespace) -> int:
 def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
     if args.recordings:
         raise UsageError(f'{args.recordings[0]}: --isolable {args.isolable} needs no recording')
-    reject(args, {'adopt': None, 'each': False, 'next': False, 'make_it': False, 'namespace': None}, 'needs a REC')
+    reject(args, dict.fromkeys(('each', 'next', 'make_it'), False), 'needs a REC')
+    reject(args, dict.fromkeys(('adopt', 'namespace', 'rehearse')), 'needs a REC')
     if args.span != FULL:
         raise UsageError('--from, --to: need a REC')
     rig = asked.rig() or load_rig()
@@ -382,8 +392,27 @@ def _searched(
     return planned(discovery, limits) if args.next else discovery
 
 
+def _rehearsed(args: argparse.Namespace, answer: Conclusion | LoopResult) -> Conclusion | LoopResult:
+    """``answer``, which is on the disk already, with its rehearsals: after Ctrl-C, with those that had ended."""
+    discovery: Any = answer.discovery if isinstance(answer, LoopResult) else answer
+    tasks, outcomes = rehearsals(discovery, args.rehearse), list[RehearsalOutcome]()
+    with tqdm(total=args.rehearse, unit=' rehearsals', leave=False, disable=args.quiet or args.json or None) as bar:
+        try:
+            for outcome in FLEET.results_of(tasks, args.executor) if args.executor else (task() for task in tasks):
+                outcomes.append(outcome)
+                bar.update()
+        except KeyboardInterrupt:
+            warn(Note(f'--rehearse {args.rehearse}: interrupted after {len(outcomes)}; the answer is complete'))
+    discovery = discovery.rehearsed(outcomes) if outcomes else discovery
+    return dataclasses.replace(answer, discovery=discovery) if isinstance(answer, LoopResult) else discovery
+
+
 def _answered(args: argparse.Namespace, answer: StudyResult, files: Mapping[str, str], hints: Sequence[str]) -> int:
     save_all(files, Path(args.out))
+    if args.rehearse is not None and isinstance(answer, Conclusion | LoopResult):
+        answer = _rehearsed(args, answer)
+        for name, text in answer.files().items():
+            save(text.encode(errors='replace'), Path(args.out) / name)
     print_answer(args, answer)
     show(*hints, f'see {Path(args.out) / "report.html"}', aside=args.json)
     return 0
@@ -432,10 +461,11 @@ def _distinguished(discovery: Discovery) -> str:
     return ' and '.join(apart) or f'{", ".join(discovery.unsettled)} apart'
 
 
-def answer_of(path: str, asked: DiscoverOptions) -> Any:
-    """The task for one of many recordings; its TaskResult."""
+def answer_of(path: str, asked: DiscoverOptions, rehearse: int | None = None) -> Any:
+    """The task for one of many recordings, with so many rehearsals; its TaskResult."""
     warnings: list[str] = []
     discovery = asked.discovered(asked.read([path], warnings.append), notify=warnings.append)
+    discovery = discovery.rehearse(rehearse) if rehearse else discovery
     files = discovery.files()
     cells: dict[str, object] = {
         'verdict': discovery.verdict,
@@ -456,7 +486,8 @@ def answer_of(path: str, asked: DiscoverOptions) -> Any:
 def _each(args: argparse.Namespace, names: list[str], asked: DiscoverOptions) -> int:
     if args.adopt is not None:
         raise UsageError(f'--adopt {args.adopt}: not with --each, which may find many laws; adopt one by itself')
-    answered: int = FLEET.answer_each(args, names, partial(answer_of, asked=asked), FIELDS, HEAD, _line)
+    work = partial(answer_of, asked=asked, rehearse=args.rehearse)
+    answered: int = FLEET.answer_each(args, names, work, FIELDS, HEAD, _line)
     return answered
 
 

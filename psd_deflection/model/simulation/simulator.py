@@ -195,24 +195,28 @@ class RigSimulator:
 
     The same ``rig`` and ``seed`` give the same samples however the loads are cut into steps. ``rig`` is the true one:
     its wiring says which channel a detector's volts really are on. Raises ConfigError if the rig contradicts itself
-    about where the PSDs are. ``ahead``: as of :class:`ForwardModel`.
+    about where the PSDs are. ``effects``, ``ahead``: as of :class:`ForwardModel`.
     """
 
-    def __init__(self, rig: Rig, seed: int = 0) -> None:
+    def __init__(self, rig: Rig, seed: int = 0, effects: Sequence[ActiveEffect] | None = None) -> None:
         check_arrangement(rig)
-        self._model = ForwardModel(rig)
+        self._model = ForwardModel(rig, effects)
         self._noise = np.random.default_rng(seed)
         self._wiring = Wiring.from_rig(rig)
         self.ahead = self._model.ahead
 
-    def step(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedStep:
+    def step(
+        self, loads: FloatArray, temperature: FloatArray | None = None, noise: FloatArray | None = None
+    ) -> SimulatedStep:
         """The next n samples: ``loads`` (n, 3) Fx N, Fy N, Tz N m at the tip centroid.
 
-        ``temperature`` (n,), degrees Celsius, or None.
+        ``temperature`` (n,), degrees Celsius, or None. ``noise`` (n, 3P): V, in place of the rig's.
         """
         samples = self._model.run(loads, temperature)
         p = self._model.physics
-        samples.volts += (p.noise * self._noise.standard_normal((len(loads), len(p.noise)))).T
+        if noise is None:
+            noise = p.noise * self._noise.standard_normal((len(loads), len(p.noise)))
+        samples.volts += noise.T
         self._model.finish(samples)
         limit = round(p.full_scale / p.volts_per_count)
         volts = self._wiring.to_device(samples.volts.T)

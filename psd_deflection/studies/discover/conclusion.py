@@ -5,9 +5,13 @@
 ``report`` makes its page.
 """
 
+from __future__ import annotations
+
+import abc
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,11 +25,13 @@ from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, e
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.recordings.observation import Observation
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
+from psd_deflection.studies.discover import rehearsal as rehearsing
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP
 from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.redundant import STAGES
@@ -59,6 +65,7 @@ class Conclusion(StudyResult):
     ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
     ``nuisance``: what every model has, each with the standard deviations of its parameters. ``remainder``: what is
     unknown as a function of named variables. ``prediction``: the model that predicts best, None if none was looked for.
+    ``rehearsal``: see :meth:`rehearse`.
     """
 
     study, json_name = 'discover', 'result.json'
@@ -85,6 +92,21 @@ class Conclusion(StudyResult):
     workspace: Comparison
     seed: int
     nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
+    rehearsal: rehearsing.Rehearsal | None = field(default=None, kw_only=True)
+
+    def rehearse(self, times: int) -> Self:
+        """Return the answer with a measured confidence: ``times`` searches in simulations of the found model, with the
+        loads, gaps and noise of what was measured. Raises ConfigError if ``times`` is below 1.
+        """
+        return self.rehearsed([run() for run in rehearsing.rehearsals(self, times)])
+
+    def rehearsed(self, outcomes: Sequence[rehearsing.RehearsalOutcome]) -> Self:
+        """Return the answer with the ``outcomes`` of its rehearsals."""
+        return replace(self, rehearsal=rehearsing.Rehearsal(rehearsing.named_by(self), tuple(outcomes)))
+
+    @abc.abstractmethod
+    def search_in_simulation(self, seed: int) -> Callable[[], Conclusion]:
+        """Return the same search in a simulation of the found model; ``seed``: of its noise."""
 
     @property
     def floors(self) -> float:
@@ -112,7 +134,8 @@ class Conclusion(StudyResult):
 
     def sentences(self) -> list[str]:
         """What is missing, or that nothing is, and which effects may have one cause."""
-        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.small_terms]
+        rehearsed = [] if self.rehearsal is None else self.rehearsal.sentences()
+        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.small_terms, *rehearsed]
 
     @property
     def unexplained(self) -> bool:
@@ -160,6 +183,7 @@ class Conclusion(StudyResult):
             'remains': self.unexplained,
             'predictive': None if self.prediction is None else self.prediction.tree(),
             'remaining': {'rms': self.gap_after, 'floors': self.floors},
+            'rehearsal': None if self.rehearsal is None else self.rehearsal.tree(),
             'gap': self._gap(),
             'nuisance': [{'name': a.effect.name, 'parameters': fitted(a, sd)} for a, sd in self.nuisance],
             'provenance': {
@@ -239,7 +263,7 @@ class RigConclusion(Conclusion):
     ``alternative_fits``: complete models that these recordings do not exclude beside ``fit``, also those of mistakes of
     the set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     ``moves``: by how much at most an estimate is wrong that is not corrected for the effects: dX m, dY m, theta rad.
-    ``late``: of PSDs on another clock, in words.
+    ``late``: of PSDs on another clock, in words. ``recordings``: as given; ``search_again``: the same search in others.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
     became, '' if it is none. ``notify``: takes warnings.
     """
@@ -253,11 +277,17 @@ class RigConclusion(Conclusion):
     unsettled: tuple[str, ...]
     moves: tuple[float, float, float]
     rig: Rig
+    recordings: tuple[Observation, ...]
+    search_again: Callable[[Sequence[Observation]], Conclusion]
     params_file: str | Path | None = None
     adopted: str = ''
     notify: Notify = warn_caller
     late: tuple[str, ...] = ()
     rig_source: str = GIVEN_RIG
+
+    def search_in_simulation(self, seed: int) -> Callable[[], Conclusion]:
+        """Return the same search in simulated recordings of the found model; ``seed``: of their noise."""
+        return partial(self.search_again, rehearsing.simulated_recordings(self, seed))
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -291,7 +321,8 @@ class RigConclusion(Conclusion):
         missing = _missing(self, ' besides' if setup else '')
         tied = [t.sentence for t in ties(self.effects)]
         annotated = _as_annotated(self)
-        return [s for s in (setup, missing, *tied, annotated, _moved(self), law_sentence(self), *self.small_terms) if s]
+        words = (setup, missing, *tied, annotated, _moved(self), law_sentence(self), *self.small_terms)
+        return [*filter(None, words), *([] if self.rehearsal is None else self.rehearsal.sentences())]
 
     def lines(self) -> list[str]:
         """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""

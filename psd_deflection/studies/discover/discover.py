@@ -333,6 +333,8 @@ def discover(
         unsettled=problem.unsettled,
         moves=pose_change(workspace_of(problem.bare), problem.fit) if problem.named else (0.0, 0.0, 0.0),
         rig=known,
+        recordings=tuple(recordings),
+        search_again=partial(discover, rig=known, seed=seed, without=without),
     )
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.fft import dct, idct
 from scipy.linalg import solve_toeplitz
 from scipy.ndimage import median_filter
-from scipy.signal import detrend
+from scipy.signal import detrend, lfilter
 
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
@@ -132,7 +132,7 @@ ALIKE = 0.2
 class NoiseModel:
     """``sigma`` (3P,) V rms a sample; ``ar`` (3P, p): on fine blocks; ``innovation`` (3P,): V rms of a
     fine block after prediction; ``block_sigma`` (3P,): V rms of the mean of one estimate block. ``slow``: what all
-    channels have besides; ``block_sigma`` has it, the others do not.
+    channels have besides; ``block_sigma`` has it, the others do not. ``sample_ar`` (3P, p): on samples; None if white.
     """
 
     sigma: FloatArray
@@ -142,6 +142,16 @@ class NoiseModel:
     rest_seconds: float
     coloured: tuple[bool, ...]
     slow: SlowNoise | None = None
+    sample_ar: FloatArray | None = None
+
+    def draw(self, n: int, period: float, rng: np.random.Generator) -> FloatArray:
+        """Return such noise (n, 3P) V, ``period`` s between samples; 1000 values before these settle the memory."""
+        rows = rng.standard_normal((len(self.sigma), n + 1000))
+        for row, phi in zip(rows, () if self.sample_ar is None else self.sample_ar, strict=False):
+            density = _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
+            row[:] = lfilter([1.0 / np.sqrt(density.mean())], [1.0, *-phi], row)
+        rows = self.sigma[:, None] * rows[:, 1000:]
+        return (rows if self.slow is None else SlowNoise.of(self.corners, n, period).unwhiten(rows)).T
 
     def with_slow_noise(self, corners: FloatArray, n: int, period: float, block: float) -> NoiseModel:
         """With slow noise of the ``corners`` (3P,), Hz, in ``n`` fine blocks ``period`` s apart.
@@ -323,7 +333,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     long = [w for w in windows if w.stop - w.start > 100]
     n, channels = residual.shape
     sigma, innovation, block_sigma = np.empty(channels), np.empty(channels), np.empty(channels)
-    ar = np.zeros((channels, ORDER))
+    ar, sample_ar = np.zeros((channels, ORDER)), np.zeros((channels, ORDER))
     coloured = []
     memories = _memories(residual, long, floors)
     frequency = np.asarray(np.fft.rfftfreq(n, 1.0), dtype=np.float64)
@@ -345,7 +355,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
             density = scale * _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
             with_memory = np.real(np.fft.ifft(density))[: len(acov)]
             memory = not with_memory[0] > (MOVING * max(_between_neighbours(residual[:, c]), floor)) ** 2
-            acov = with_memory if memory else acov
+            acov, sample_ar[c] = (with_memory, phi) if memory else (acov, 0.0)
         coloured.append(bool(memory))
         sigma[c] = np.sqrt(acov[0])
         of_fine = _block_autocovariance(acov, fine, ORDER + 1)
@@ -356,4 +366,4 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
             innovation[c] = np.sqrt(of_fine[0])
         block_sigma[c] = np.sqrt(_block_autocovariance(acov, block, 1)[0])
     rest_seconds = sum(w.stop - w.start for w in windows) * observation.period
-    return NoiseModel(sigma, ar, innovation, block_sigma, rest_seconds, tuple(coloured))
+    return NoiseModel(sigma, ar, innovation, block_sigma, rest_seconds, tuple(coloured), None, sample_ar)

@@ -5,9 +5,11 @@ parameter of its likelihood (N log RSS for each channel), and N counts correlati
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -21,6 +23,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.conclusion import Conclusion
+from psd_deflection.studies.discover.noise import NoiseModel
 from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_tables, table_of
 from psd_deflection.studies.discover.problem import Machine, Progress
 from psd_deflection.studies.discover.report import sections
@@ -319,6 +322,10 @@ class PlantDiscovery(Conclusion):
 
     workspace: PlantComparison
 
+    def search_in_simulation(self, seed: int) -> Callable[[], PlantDiscovery]:
+        """Return the same search in tables that the found model simulates; ``seed``: of their noise."""
+        return partial(discover_in, simulated_plant(self, seed), seed=self.seed)
+
     def sections(self) -> Iterable[PageSection]:
         """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
         return sections(self)
@@ -339,6 +346,25 @@ class PlantDiscovery(Conclusion):
         if not isinstance(plant, Plant):
             plant = self.workspace.plant.like(plant)
         return [np.asarray(rows, dtype=np.float64) for rows in plant.simulate_effects(self.predicting)]
+
+
+def simulated_plant(answer: PlantDiscovery, seed: int) -> Plant:
+    """Return the plant with what its found model would have measured: noise as stated, else as what remains."""
+    rng, ws, fit = np.random.default_rng(seed), answer.workspace, answer.fit
+    freedom = np.maximum(ws.independent - len(fit.free) / len(ws.channels), 1.0)
+    level = np.where(ws.known > 0.0, ws.known, ws.gap_per_channel(fit.difference) * np.sqrt(ws.independent / freedom))
+    apart = np.maximum(ws.total, 1) / ws.independent if ws.plant.period > 0.0 else np.ones(len(level))
+    memory = (np.maximum(apart - 1.0, 0.0) / (apart + 1.0))[:, None]
+    noise = NoiseModel(level, 0.0 * memory, level, level, 0.0, (), None, memory)
+    simulated = ws.simulate([*ws.base, *fit.coefficients_with_nuisance])
+    tables = [
+        # A channel that the model simulates to the last digit is no measurement.
+        np.where(there, s + noise.draw(s.shape[1], ws.plant.period, rng).T, np.where(ws.total[:, None], np.nan, given))
+        for given, s, there in zip(ws.plant.measured(), simulated, ws.there, strict=True)
+    ]
+    plant = copy.copy(ws.plant)
+    vars(plant)['measured'] = partial(list, tables)
+    return plant
 
 
 def _powers(name: str, values: Sequence[FloatArray]) -> dict[str, Sequence[FloatArray]]:

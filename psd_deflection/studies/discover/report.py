@@ -276,7 +276,7 @@ def sections(discovery: Conclusion) -> list[PageSection]:
         most = len(head) if any(row[-1] for row in wrong) else -1
         out.append(PageSection('Set-up', (table(head[:most], [row[:most] for row in wrong]),)))
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
-    out.append(PageSection('What', (*effects, *_nuisance(discovery))))
+    out.append(PageSection('What', (*effects, *_nuisance(discovery), *_rehearsed(discovery))))
     law = [] if of_rig is None or of_rig.law is None else _law_section(of_rig, of_rig.law)
     if discovery.unexplained and discovery.prediction is not None:
         out.append(PageSection('What predicts', tuple(_predicts(discovery, discovery.prediction))))
@@ -306,6 +306,14 @@ def _nuisance(discovery: Conclusion) -> list[str]:
     ]
     head = ('effect', 'parameter', 'value', '± sd', 'unit')
     return ['<p>Fitted in every model, and no finding:</p>', table(head, fitted)]
+
+
+def _rehearsed(discovery: Conclusion) -> list[str]:
+    if discovery.rehearsal is None:
+        return []
+    tree = discovery.rehearsal.tree()
+    rows = [('the same', tree['again']), *((', '.join(o['effects']), o['times']) for o in tree['otherwise'])]
+    return [f'<p>{html.escape(discovery.rehearsal.sentences()[0])}</p>', table(('named by', 'rehearsals'), rows)]
 
 
 def _unknown(u: Unknown) -> str:

@@ -316,13 +316,8 @@ def test_a_coarse_channel_beside_fine_ones_is_that_channel() -> None:
 @pytest.mark.parametrize(
     ('step', 'noise', 'file'),
     [
-        (FILE, 2e-3, FILE),
-        (FILE, 2e-4, FILE),
-        (FILE / 4.0, 2e-3, FILE),
-        (20.0 / 2**24, 2e-3, 20.0 / 2**24),
-        (TEN, 2e-3, TEN),
-        (0.0, 2e-3, FILE),
-        (0.0, 1e-7, FILE),
+        *((FILE, 2e-3, FILE), (FILE, 2e-4, FILE), (FILE / 4.0, 2e-3, FILE), (20.0 / 2**24, 2e-3, 20.0 / 2**24)),
+        *((TEN, 2e-3, TEN), (0.0, 2e-3, FILE), (0.0, 1e-7, FILE)),
     ],
 )
 def test_steps_that_are_no_coarser_than_the_files_are_none(step: float, noise: float, file: float) -> None:

@@ -184,13 +184,8 @@ def test_reading_shift_moves_pose_as_least_squares(certificate: Certificate) -> 
 
 def test_default_poses_are_rest_and_observed_extremes() -> None:
     expected = [
-        (0.0, 0.0, 0.0),
-        (-2e-3, 0.0, 0.0),
-        (1e-3, 0.0, 0.0),
-        (0.0, -2.5e-3, 0.0),
-        (0.0, 2e-3, 0.0),
-        (0.0, 0.0, -0.02),
-        (0.0, 0.0, 0.03),
+        *((0.0, 0.0, 0.0), (-2e-3, 0.0, 0.0), (1e-3, 0.0, 0.0), (0.0, -2.5e-3, 0.0), (0.0, 2e-3, 0.0)),
+        *((0.0, 0.0, -0.02), (0.0, 0.0, 0.03)),
     ]
     assert default_poses(_tree()) == expected
     assert certify(_problem(poses=())).poses.tolist() == [list(pose) for pose in expected]

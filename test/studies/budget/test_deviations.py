@@ -25,37 +25,18 @@ from psd_deflection.studies.budget.term import Situation, Term
 # Every number of it differs from its neighbours.
 RIG = replace_values(
     load_rig(),
-    {
-        'link.length': 0.7,
-        'psd_1.center': [0.01, 0.080],
-        'psd_2.center': [-0.11, 0.02],
-        'psd_1.height': 0.03,
-        'psd_2.height': -0.02,
-        'psd_1.active_area': [0.010, 0.012],
-        'psd_2.active_area': [0.008, 0.014],
-        'psd_1.zero': [1e-4, -2e-4],
-        'psd_2.zero': [3e-4, 5e-4],
-        'psd_1.sensitivity': [4e-4, 5e-4],
-        'psd_2.sensitivity': [6e-4, 7e-4],
-    },
+    {'link.length': 0.7, 'psd_1.center': [0.01, 0.080], 'psd_2.center': [-0.11, 0.02]}
+    | {'psd_1.height': 0.03, 'psd_2.height': -0.02, 'psd_1.zero': [1e-4, -2e-4], 'psd_2.zero': [3e-4, 5e-4]}
+    | {'psd_1.active_area': [0.010, 0.012], 'psd_2.active_area': [0.008, 0.014]}
+    | {'psd_1.sensitivity': [4e-4, 5e-4], 'psd_2.sensitivity': [6e-4, 7e-4]},
 )
 LOAD = (6.0, -20.0, -10.0)
-INPUTS = {
-    'laser_wavelength': 700e-9,
-    'laser_diameter': 0.8e-3,
-    'laser_power': 0.7e-3,
-    'responsivity': 0.3,
-    'temperature': 301.0,
-    'temperature_change': 3.0,
-    'air_gradient': 7.0,
-    'air_step': 13.0,
-    'air_step_angle': 0.3,
-    'interference': 3e-3,
-    'interference_frequency': 57.0,
-    'zero_blocks': 9.0,
-    'bracket_temperature': 2.0,
-    'slope_ratio_tolerance': 0.3,
-}
+INPUTS = (
+    {'laser_wavelength': 700e-9, 'laser_diameter': 0.8e-3, 'laser_power': 0.7e-3, 'responsivity': 0.3}
+    | {'temperature': 301.0, 'temperature_change': 3.0, 'bracket_temperature': 2.0, 'slope_ratio_tolerance': 0.3}
+    | {'air_gradient': 7.0, 'air_step': 13.0, 'air_step_angle': 0.3, 'zero_blocks': 9.0}
+    | {'interference': 3e-3, 'interference_frequency': 57.0}
+)
 
 
 def _at(method: str = 'exact', rig: Rig = RIG, load: tuple[float, float, float] = LOAD, **more: float) -> Situation:

@@ -656,29 +656,15 @@ def test_the_law_is_written_with_the_first_unknown(study: Discovery) -> None:
     law = Law('law_y2', 'psd', 'y2', (LawTerm('product', ('load_fx',), 1e-6),))
     other = Law('law_beam_y2', 'optics', 'beam_y2', law.terms)
     further = Law('law_x1', 'psd', 'x1', law.terms)
-    of_law = FoundLaw(
-        law,
-        (further,),
-        dataclasses.replace(study.fit, effects=study.fit.effects * 3),
-        study.fit,
-        ('y2',),
-        (other,),
-        1e-9,
-        30.0,
-        HeldOut(9.0, 2.0),
-        3e-7,
-    )
+    fits = dataclasses.replace(study.fit, effects=study.fit.effects * 3), study.fit
+    of_law = FoundLaw(law, (further,), *fits, ('y2',), (other,), 1e-9, 30.0, HeldOut(9.0, 2.0), 3e-7)
     unknown = (Unknown('first', ('load_fx',), 0.75, rms=2e-6), Unknown('second', (), 0.5))
     first, second = dataclasses.replace(study, unknown=unknown, law=of_law).tree()['unknown']
     assert second == {'signature': 'second', 'depends_on': [], 'explains': 0.5, 'rms': 0.0, 'law': None}
     written = first.pop('law')
     assert first == {'signature': 'first', 'depends_on': ['load_fx'], 'explains': 0.75, 'rms': 2e-6}
-    assert written == {
-        'stage': 'psd',
-        'acts_on': 'y2',
-        'channels': ['y2'],
-        'variables': ['load_fx'],
-        'kind': law.kind,
+    head = {'stage': 'psd', 'acts_on': 'y2', 'channels': ['y2'], 'variables': ['load_fx'], 'kind': law.kind}
+    assert written == head | {
         'expression': law.expression,
         'further': [further.expression],
         'heldout_after': 3e-7,

@@ -54,14 +54,8 @@ def test_two_dozen_values_are_few_and_one_more_is_many(observed: tuple[Workspace
 @pytest.mark.parametrize(
     ('target', 'of'),
     [
-        ('x1', 'load_fy'),
-        ('y2', 'dx'),
-        ('sum1', 'load_tz'),
-        ('sum2', 'temperature'),
-        ('dx', 'load_tz'),
-        ('theta', 'dy'),
-        ('static_dy', 'load_fx'),
-        ('static_theta', 'load_fx'),
+        *(('x1', 'load_fy'), ('y2', 'dx'), ('sum1', 'load_tz'), ('sum2', 'temperature'), ('dx', 'load_tz')),
+        *(('theta', 'dy'), ('static_dy', 'load_fx'), ('static_theta', 'load_fx')),
     ],
 )
 def test_a_gain_is_that_of_the_simulated_picture(observed: tuple[Workspace, Fit], target: str, of: str) -> None:

@@ -25,7 +25,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
 from psd_deflection.studies.discover import cleaning, conclusion, law_features, laws, plants, setup, steps
 from psd_deflection.studies.discover.hidden import FIRST, LoadDirection, ZeroDirection
-from psd_deflection.studies.discover.noise import estimate_noise
+from psd_deflection.studies.discover.noise import SlowNoise, estimate_noise
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.search import fit as validate
 from psd_deflection.studies.discover.search import localise, proposals, weighing
@@ -258,6 +258,13 @@ def test_a_memory_of_noise_is_that_of_its_process() -> None:
     phi = np.linalg.solve([[c[0], c[1]], [c[1], c[0]]], c[1:])
     np.testing.assert_allclose(model.ar, np.tile(phi, (6, 1)), atol=0.05)
     assert model.innovation == pytest.approx(np.full(6, math.sqrt(c[0] - phi @ c[1:])), rel=0.05)
+    drawn = model.draw(n, 1e-3, np.random.default_rng(0))
+    again = estimate_noise(o, drawn, 4, np.full(6, 1e-6))
+    assert again.sigma == pytest.approx(model.sigma, rel=0.05)
+    np.testing.assert_allclose(again.innovation, model.innovation, rtol=0.05)
+    slow = dataclasses.replace(model, slow=SlowNoise.of(np.full(6, 3.0), 10, 4e-3))
+    white = SlowNoise.of(slow.corners, n, 1e-3).whiten(slow.draw(n, 1e-3, np.random.default_rng(0)).T)
+    np.testing.assert_allclose(white.T, drawn, atol=1e-12)
     # A level below the floor has no memory.
     floor = np.full(6, 2.0 * sigma)
     assert estimate_noise(o, rows, 4, floor).coloured == (False,) * 6

@@ -21,6 +21,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover import plant_search
 from psd_deflection.studies.discover.plant_search import PlantComparison, discover_in
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.rehearsal import UNKNOWN, Named, Rehearsal, RehearsalOutcome
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.search import Search
@@ -509,3 +510,52 @@ def test_noise_of_a_plant_is_nothing_missing() -> None:
     search = Search(PlantComparison(steel(0.0)), lambda *_: cast(Any, None))
     for p, passes in ((0.0099, True), (0.0101, False)):
         assert search.may_pass(Score(cast(Any, None), 1e3, 1, p, np.zeros(1))) is passes
+
+
+@pytest.mark.parametrize('size', [0.4, 0.0])
+def test_rehearsed_plant_gets_its_own_answer_again(size: float) -> None:
+    answer = discover_in(steel(size, noise=(0.02, 0.02))).rehearse(2)
+    tree = answer.tree()['rehearsal']
+    assert (tree['times'], tree['again'], tree['sizes'], tree['failed']) == (2, 2, 2 if size else 0, 0)
+    words = (
+        'with the found effects: found again in 2' if size else 'without a missing effect: nothing missing in 2 of 2'
+    )
+    assert f'Rehearsed 2 times on simulated recordings {words}.' in answer.sentence
+    assert words in answer.report()
+    with pytest.raises(ConfigError, match='times = 0: must be at least 1'):
+        answer.rehearse(0)
+
+
+def test_rehearsal_of_alike_effects_near_noise_differs() -> None:
+    rng = np.random.default_rng(4)
+    b = [rng.standard_normal((1, 12)) for _ in range(4)]
+    a = [rows + 0.3 * rng.standard_normal((1, 12)) for rows in b]
+    observed = [0.014 * rows + 0.02 * rng.standard_normal((1, 12)) for rows in b]
+    given: dict[str, Any] = {'channels': ('force',), 'units': ('N',), 'noise': (0.02,)}
+    answer = discover_in(Pictures(observed, {'a': a, 'b': b}, cases=tuple('abcd'), **given)).rehearse(3)
+    assert [(e.name, e.equivalent) for e in answer.effects] == [('a', ('b',))]
+    tree = answer.tree()['rehearsal']
+    assert (tree['again'], tree['by_equivalent'], tree['otherwise']) == (2, {'b': 1}, [{'effects': [], 'times': 1}])
+    assert 'found again in 2 (in 1 its equivalent b); once nothing instead.' in answer.sentence
+
+
+def test_rehearsal_counts_what_is_named_and_sizes_inside() -> None:
+    gain, skew = (Named(n, f'{n} (psd 1)', e, {'x': 1.0}, {'x': 0.1}) for n, e in (('gain', ('lag',)), ('skew', ())))
+    inside, outside = gain._replace(values={'x': 1.19}), skew._replace(values={'x': 0.8})
+    lag = inside._replace(name='lag', label='lag (psd 2)')
+    named = [(outside, inside), (skew, lag), (lag, gain), (gain, skew, UNKNOWN), (gain,), (gain,)]
+    outcomes = (*map(RehearsalOutcome, named), RehearsalOutcome(error='ValueError: late'))
+    rehearsal = Rehearsal((gain, skew), outcomes)
+    tree = rehearsal.tree()
+    assert (tree['again'], tree['by_equivalent']) == (2, {'lag (psd 2)': 1})
+    assert (tree['sizes'], tree['sizes_in_interval'], tree['failed']) == (3, 2, 1)
+    assert tree['otherwise'][0] == {'effects': ['gain (psd 1)'], 'times': 2}
+    assert sum(o['times'] for o in tree['otherwise']) == 4
+    sentence, sizes = rehearsal.sentences()
+    assert '; 2 times gain (psd 1) instead; once gain (psd 1) and lag (psd 2) instead;' in sentence
+    assert sentence.endswith('; once failed (ValueError: late).')
+    assert sizes == '2 of 3 sizes were within their 95 % intervals.'
+    # What is unknown is not simulated.
+    unknown = dataclasses.replace(rehearsal, expected=(gain, skew, UNKNOWN))
+    assert unknown.tree()['again'] == 3
+    assert unknown.sentences()[-1] == 'The simulated recordings lack what is unknown.'

@@ -3,10 +3,13 @@
 """Tables of readings, a row for each load that hung; recordings of loads and a reference; rigs of three PSDs."""
 
 import dataclasses
+import itertools
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,11 +27,15 @@ from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, Tempe
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import differences, fix_of, parameters
+from psd_deflection.studies.discover import plant_search
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.plant_search import discover_in
-from psd_deflection.studies.discover.plants import CHANNELS, Readings, ReadingsPlant
+from psd_deflection.studies.discover.noise import SlowNoise
+from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
+from psd_deflection.studies.discover.plants import CHANNELS, Plant, Readings, ReadingsPlant
 from psd_deflection.studies.discover.readings import read_tables
 from psd_deflection.studies.discover.redundant import fourth, fourth_reading
+from psd_deflection.studies.discover.rehearsal import simulated_recordings
+from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
@@ -353,6 +360,29 @@ def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: floa
     assert list(discovery.per_channel) == list(dot_names(3))
 
 
+def test_simulated_recordings_have_wiring_gaps_and_noise() -> None:
+    world = {'psd_2.axes': ['-y', 'x'], 'amplifier.noise': 2.0 * TWO.amplifier.noise}
+    o = make_observation(TWO, 'sensor_rotation,psd=2,angle=0.01', world=world)
+    rig = replace_values(TWO, {'psd_1.axes': ['x', '-y']})
+    given = dataclasses.replace(o, rig=rig, volts=Wiring.from_rig(rig).to_psds(o.volts))
+    given.volts[2000:2300, 3] = np.nan
+    (corrected,), _, _ = correct_wiring([given], ())
+    ws = Workspace([corrected])
+    fit = refit(ws, [make_active('sensor_rotation', {'psd': 2, 'angle': 0.0}, 'test')])
+    effects = (SimpleNamespace(active=fit.effects[0]),)
+    answer = SimpleNamespace(recordings=(given,), workspace=ws, known=(), fit=fit, effects=effects, late=())
+    (first,), (second,) = (simulated_recordings(cast(Any, answer), seed) for seed in (1, 2))
+    assert (first.rig, first.loads) == (given.rig, given.loads)
+    for other in (given, second):
+        np.testing.assert_array_equal(np.isnan(first.volts), np.isnan(other.volts))
+        sd = np.nanstd(first.volts - other.volts, axis=0)
+        assert sd == pytest.approx(math.sqrt(2.0) * ws.noise[0].sigma, rel=0.05)
+    for corner, observed in ((0.01, False), (20.0, True)):
+        noise = dataclasses.replace(ws.noise[0], slow=SlowNoise.of(np.full(6, corner), 10, 1e-3))
+        answer.workspace = ws.replaced(noise=(noise,))
+        assert np.array_equal(simulated_recordings(cast(Any, answer), 1)[0].volts, first.volts, True) is not observed
+
+
 @pytest.mark.slow
 def test_wrong_wiring_and_effect_of_six_psds_are_named() -> None:
     discovery = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
@@ -476,7 +506,9 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
         Observation('x', SIX, make_observation(THREE).volts, PUSHES)
 
 
-def test_terms_of_any_table_are_named_and_predict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_terms_of_any_table_are_named_and_predict(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng, names = np.random.default_rng(3), ['az [deg]', 'force [N]', 'way']
     u = np.column_stack((rng.uniform(0.0, 360.0, 80), rng.uniform(10.0, 30.0, 80), rng.choice([-1.0, 1.0], 80)))
     u[:2, 1] = 10.0, 30.0
@@ -494,8 +526,22 @@ def test_terms_of_any_table_are_named_and_predict(tmp_path: Path, capsys: pytest
     (predicted,) = discovery.predict(tmp_path / 'b.csv')
     assert np.sqrt(np.mean((predicted[0] - y[60:]) ** 2)) < 0.08
     words = ['--inputs', ','.join(names), '--outputs', 'd [mm]', '--parts', 'day', '--out', str(tmp_path / 'out')]
-    assert main(['discover', str(tmp_path / 'a.csv'), *words]) == 0
-    assert 'd: sin az' in capsys.readouterr().out
+    # The search of the table, then one a rehearsal: the third ends all, or fails.
+    ends, searches = iter((KeyboardInterrupt, ValueError)), itertools.count()
+
+    def search(plant: Plant, **options: Any) -> PlantDiscovery:
+        n = next(searches) % 4
+        if n == 3:
+            raise next(ends)
+        return discovery if n else discover_in(plant, **options)
+
+    monkeypatch.setattr(plant_search, 'discover_in', search)
+    for counts in ((2, 0), (3, 1)):
+        assert main(['discover', str(tmp_path / 'a.csv'), *words, '--rehearse', '3']) == 0
+        assert 'd: sin az' in capsys.readouterr().out
+        rehearsal = json.loads((tmp_path / 'out' / 'result.json').read_text())['rehearsal']
+        assert (rehearsal['times'], rehearsal['failed'], rehearsal['again']) == (*counts, 2)
+    monkeypatch.undo()
     options: dict[str, Any]
     for options, message in (
         ({'inputs': ['q']}, 'the header lacks q'),

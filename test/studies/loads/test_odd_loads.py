@@ -295,13 +295,8 @@ def with_memory(count: int, wanted: float) -> FloatArray:
 @pytest.mark.parametrize(
     ('count', 'memory', 'noise'),
     [
-        (400, 0.19, True),
-        (400, -0.19, True),
-        (400, 0.21, False),
-        (400, -0.21, False),
-        (10_000, 0.145, True),
-        (10_000, 0.155, False),
-        (10_000, -0.155, False),
+        *((400, 0.19, True), (400, -0.19, True), (400, 0.21, False), (400, -0.21, False), (10_000, 0.145, True)),
+        *((10_000, 0.155, False), (10_000, -0.155, False)),
     ],
 )
 def test_noise_correlation_is_below_four_over_root_n(count: int, memory: float, noise: bool) -> None:
