@@ -22,6 +22,7 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.planning import SEPARATES
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
@@ -163,7 +164,8 @@ def isolable(
     if the loads are too short for a search.
     """
     counts = RigSimulator(rig).step(loads).counts
-    planned = Observation('planned', rig, counts.astype(np.float64) * rig.converter.volts_per_count, loads)
+    volts = Wiring.from_rig(rig).to_psds(counts * rig.converter.volts_per_count)
+    planned = Observation('planned', rig, volts, loads)
     machine = RecordedRig.of([planned], rig, without, None, progress)
     problem = Problem.of(machine, 0, progress, np.random.default_rng(0))
     screen = problem.search.screen
