@@ -91,7 +91,6 @@ def test_what_came_again_and_again_is_missed() -> None:
     robot = RobotWatch()
     robot.scaled(1.0, 1.0)
     robot.controlled(1.4)
-    assert robot.fault(1.45) == ''
-    assert robot.fault(1.6) == 'the robot does not run: its speed scaling comes no more'
+    assert (robot.fault(1.45), robot.fault(1.6)) == ('', 'the robot does not run: its speed scaling comes no more')
     robot.scaled(2.0, 1.0)
     assert robot.fault(2.1) == 'the robot does not run: its state of the controller comes no more'

@@ -83,10 +83,8 @@ def test_what_is_not_finite_gives_no_number_and_no_error() -> None:
 @given(st.floats(-1e5, 1e5), st.floats(-1e5, 1e5))
 def test_floats_and_arrays_have_the_same_bits(x: float, y: float) -> None:
     a, b = np.array([x]), np.array([y])
-    assert FIXED.sin_many(a)[0] == FIXED.sin(x)
-    assert FIXED.cos_many(a)[0] == FIXED.cos(x)
-    assert FIXED.atan2_many(b, a)[0] == FIXED.atan2(y, x)
-    assert FIXED.hypot_many(a, b)[0] == FIXED.hypot(x, y)
+    assert (FIXED.sin_many(a)[0], FIXED.cos_many(a)[0]) == (FIXED.sin(x), FIXED.cos(x))
+    assert (FIXED.atan2_many(b, a)[0], FIXED.hypot_many(a, b)[0]) == (FIXED.atan2(y, x), FIXED.hypot(x, y))
     small = x / 1e3
     assert FIXED.exp_many(np.array([small]))[0] == FIXED.exp(small)
     assert FIXED.power_many(a, 3)[0] == FIXED.power(x, 3)

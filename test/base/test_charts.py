@@ -57,8 +57,7 @@ def test_what_is_declared_reaches_the_page() -> None:
     series = Series('a', x, x, 'red', 'points', half_width=x / 10.0, bold=True)
     panel = Panel((series,), 'f / Hz', 'y / m', log='x, y', rules=[Rule(1.5, 'here')], y_range=(0.0, 3.0), height=99)
     content = reported(Chart('what it shows', [panel], beside=2))
-    assert content['words'] == 'what it shows'
-    assert content['beside'] == 2
+    assert (content['words'], content['beside']) == ('what it shows', 2)
     (only,) = content['panels']
     assert (only['x'], only['y'], only['log'], only['range'], only['height']) == ('f / Hz', 'y / m', 'x, y', [0, 3], 99)
     assert only['rules'] == [[1.5, 'here', False, 'quiet']]
@@ -83,8 +82,7 @@ def test_a_long_curve_keeps_its_extremes_and_its_gaps() -> None:
     content = reported(chart_of(x, y, np.zeros(n)))
     at, drawn_y = (column(content, place) for place in (0, 1))
     assert len(at) <= 4 * BUCKETS + 4
-    assert drawn_y[np.argmin(np.abs(at - 51.234))] == 100.0
-    assert drawn_y[np.argmin(np.abs(at - 73.210))] == -90.0
+    assert (drawn_y[np.argmin(np.abs(at - 51.234))], drawn_y[np.argmin(np.abs(at - 73.210))]) == (100.0, -90.0)
     assert np.isnan(drawn_y[np.argmin(np.abs(at - 20.0))])
     assert at[[0, -1]] == pytest.approx(x[[0, -1]])
     assert content['note'] == 'of every 100 points the least and the largest are drawn'
@@ -176,11 +174,9 @@ def test_a_column_may_have_words_numbers_and_none() -> None:
 def test_xarray_has_the_units() -> None:
     pytest.importorskip('xarray')
     data = TABLE.to_xarray()
-    assert data['a'].values.tolist() == [0.0, 2.0, 4.0]
-    assert data['a'].attrs == {'units': 'm', 'long_name': 'one'}
+    assert (data['a'].values.tolist(), data['a'].attrs) == ([0.0, 2.0, 4.0], {'units': 'm', 'long_name': 'one'})
     # A number without a unit has the unit 1, as the CF conventions have it.
-    assert data['b'].attrs['units'] == '1'
-    assert data['t'].attrs == {'units': 's', 'long_name': 'time'}
+    assert (data['b'].attrs['units'], data['t'].attrs) == ('1', {'units': 's', 'long_name': 'time'})
     assert data.attrs == {'path': 'somewhere'}
 
 

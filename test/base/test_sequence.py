@@ -148,8 +148,7 @@ def test_recording_follows_if_number_and_time_increase() -> None:
 
 def test_time_going_back_is_reported_and_then_kept() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
-    assert of.extended([8, 9, 10], [6.5, 8.0, 9.0]) == [8, 9, 10]
-    assert of.message == ['time goes back to 6500000 ns']
+    assert (of.extended([8, 9, 10], [6.5, 8.0, 9.0]), of.message) == ([8, 9, 10], ['time goes back to 6500000 ns'])
     assert not of.follows([11], [8.5])
     assert of.follows([11], [9.5])
 
@@ -185,8 +184,7 @@ def test_the_last_number_once_more_is_a_restart_of_a_recording() -> None:
 
 def test_the_number_after_the_last_of_32_bits_is_0_and_goes_on() -> None:
     of = Recorded([WRAP - 1], [0.0])
-    assert of.message == []
-    assert of.extended([0], [1.0]) == [WRAP]
+    assert (of.message, of.extended([0], [1.0])) == ([], [WRAP])
     assert of.follows([1], [2.0])
     assert of.extended([1, 2], [2.0, 3.0]) == [WRAP + 1, WRAP + 2]
     assert (of.message, of.restarts) == ([], [])

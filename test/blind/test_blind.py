@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from blind import generator, run
 from blind.cases import DRAWS, EFFECTS, NOISES, Case, designs, short_cases
 from blind.coverage import ROWS, UNEQUAL, Inside, fault, on_a_moving_base, over_the_bound, score, warming
+from blind.draws import MOST, duel
 from blind.generator import LINK
 from blind.redone import SHORT, HeldLoad, main, motion
 from psd_deflection.model.simulation.catalogue import make_active, sort_effects
@@ -144,3 +145,8 @@ def test_calibrated_on_the_sidebar_the_rig_is_right_on_the_link(tmp_path: Path) 
         'psd-deflection calibrate sidebar_right_50N',
     ):
         assert words in page
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_a_drawn_plant_is_predicted_as_by_the_better_peer(seed: int) -> None:
+    assert duel(seed).ratio <= MOST

@@ -179,8 +179,7 @@ def test_the_lens_is_found_again() -> None:
     tilts = [(0.4, 0.0), (-0.4, 0.1), (0.0, 0.4), (0.1, -0.4), (0.3, 0.3), (-0.3, -0.3)]
     images = [(f'{i}.png', shot(scene, BOARD, Pose(phi=a, omega=b), rng)) for i, (a, b) in enumerate(tilts)]
     fitted = calibrated(BOARD, [*images, ('broken.png', None)])
-    assert fitted.used == len(tilts)
-    assert fitted.excluded == [('broken.png', 'unreadable image')]
+    assert (fitted.used, fitted.excluded) == (len(tilts), [('broken.png', 'unreadable image')])
     assert fitted.matrix[0, 0] == pytest.approx(scene.focal, rel=0.01)
     lens = Lens(fitted.matrix, fitted.distortion)
     true = Lens(np.array(scene.matrix).reshape(3, 3), np.array([-0.15, 0.05, 0, 0]))

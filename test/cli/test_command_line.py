@@ -172,8 +172,7 @@ def test_an_effect_is_explained_with_a_command_that_runs(name: str, tmp_path: Pa
 def test_programs_get_the_declaration(capsys: Capsys) -> None:
     assert main(['effects', 'sensor_rotation', '--json']) == 0
     effect = json.loads(capsys.readouterr().out)['sensor_rotation']
-    assert effect['corrected'] == 'reading'
-    assert effect['parameters']['angle']['unit'] == 'rad'
+    assert (effect['corrected'], effect['parameters']['angle']['unit']) == ('reading', 'rad')
     assert effect['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
 
 

@@ -56,8 +56,7 @@ def test_each_engine_gives_the_serial_answer(archive: Path, scheduler: str, caps
         reported = capsys.readouterr()
         assert reported.err.endswith('psd-deflection replay: 1 of 3 recordings failed; the others are done\n')
         stated[executor] = (reported.out, out.read_bytes())
-    assert stated['processes:1'] == stated['serial']
-    assert stated[scheduler] == stated['serial']
+    assert (stated['processes:1'], stated[scheduler]) == (stated['serial'], stated['serial'])
     rows = [json.loads(line) for line in stated['serial'][0].splitlines()]
     assert [Path(row['recording']).name for row in rows] == ['broken.csv', 'one.mcap', 'two.mcap']
     assert 'the header lacks' in rows[0]['error']
@@ -106,8 +105,7 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
     assert frame.error.tolist() == ['', f'{archive}/nowhere.csv: no such recording']
     assert frame.result[0] == files['calibration.json'].read_text()
     for name, fitted in json.loads(frame.result[0])['parameters'].items():
-        assert frame[name][0] == fitted['value']
-        assert frame[f'sd {name}'][0] == fitted['sd']
+        assert (frame[name][0], frame[f'sd {name}'][0]) == (fitted['value'], fitted['sd'])
 
 
 def test_folders_are_those_of_the_archive(tmp_path: Path) -> None:

@@ -70,8 +70,7 @@ def test_bytes_go_both_ways(connected: Connected) -> None:
     connected.peer.sendall(b'\x00hello\x00')
     assert all_of(connected.port, 7) == b'\x00hello\x00'
     connected.port.write(b'question')
-    assert connected.peer.recv(100) == b'question'
-    assert connected.port.read(0.0) == b''
+    assert (connected.peer.recv(100), connected.port.read(0.0)) == (b'question', b'')
     assert connected.port.notices() == []
 
 
@@ -239,8 +238,7 @@ def test_others_are_counted_and_reported_once(udp: Datagrammed) -> None:
     stranger.send(b'device too')
     device.send(b'3')
     assert all_of(udp.port, 1) == b'3'
-    assert udp.port.notices() == []
-    assert udp.port.describe()['datagrams of other senders'] == '6'
+    assert (udp.port.notices(), udp.port.describe()['datagrams of other senders']) == ([], '6')
 
 
 def test_silent_sender_yields_to_device_not_to_junk(udp: Datagrammed, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,8 +84,7 @@ def test_the_survey_recognises_it(
     port = str(served(twin).link)
     assert main(['devices', '--json', port]) == 0
     tree = json.loads(capsys.readouterr().out)
-    assert tree['suggested'] == [{'source': NAME, 'port': port}]
-    assert tree['ports'][0]['answer'] == 'my converter 7'
+    assert (tree['suggested'], tree['ports'][0]['answer']) == ([{'source': NAME, 'port': port}], 'my converter 7')
 
 
 def test_one_without_a_twin_is_rejected_where_a_twin_is_needed(

@@ -52,8 +52,7 @@ def test_simulated_device_probe_suggests_its_rig(
     assert [port.source for port in ports] == [name] * len(twins)
     (suggested,) = survey.suggestions([device], ports)
     rig = rig_from_values(suggested)
-    assert rig.acquisition.source == name
-    assert rig.acquisition.port == ','.join(port.port for port in ports)
+    assert (rig.acquisition.source, rig.acquisition.port) == (name, ','.join(port.port for port in ports))
 
 
 def test_an_unknown_device_cannot_be_simulated() -> None:

@@ -161,8 +161,7 @@ def test_a_link_replaces_a_link_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_pair_ports_have_own_links_and_fail_together(tmp_path: Path) -> None:
-    assert link_names('rig', 1) == ['rig']
-    assert link_names(None, 2) == [None, None]
+    assert (link_names('rig', 1), link_names(None, 2)) == (['rig'], [None, None])
     links = link_names(str(tmp_path / 'rig'), 2)
     with open_terminals(links) as ports:
         assert [str(Path(str(link)).readlink()) for link in links] == [port.name for port in ports]

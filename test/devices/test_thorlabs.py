@@ -437,6 +437,5 @@ def test_the_simulated_one_says_what_it_is_and_nothing_by_itself(unloaded: Any) 
     assert device.receive(b'info 0\rinfo', 0) == b'info 0 DATAQ\r\x00'
     assert device.receive(b' 1\r', 0) == b'info 1 2108\r\x00'
     assert device.receive(b'slist 0 10\rsrate 60000\rdec 1\rstart\r', 0).count(b'\r') == 3
-    assert device.take(2_000_000) == struct.pack('<3h', *[-32768] * 3)
-    assert device.receive(b'info 0\r', 0) == b''
+    assert (device.take(2_000_000), device.receive(b'info 0\r', 0)) == (struct.pack('<3h', *[-32768] * 3), b'')
     assert device.receive(b'stop\r', 0) == b'stop\r\x00'

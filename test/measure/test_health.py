@@ -48,16 +48,14 @@ def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> Non
     x, y = rig.centers[psd - 1]
     dot = (c * (x - dx) + s * (y - dy) - x, -s * (x - dx) + c * (y - dy) - y)
     got = OnePsd(Geometry.from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
-    assert got[0] == pytest.approx(dx, abs=1e-15)
-    assert got[1] == pytest.approx(dy, abs=1e-15)
+    assert (got[0], got[1]) == (pytest.approx(dx, abs=1e-15), pytest.approx(dy, abs=1e-15))
 
 
 def test_off_is_the_default_and_nothing_is_estimated() -> None:
     pipeline = Pipeline(load_rig())
     records = records_of(pipeline, dark(moving(12), 2, slice(4, 8)))
     assert sorted(primaries(records)) == [0, 1, 2, 3, 8, 9, 10, 11]
-    assert pipeline.counters.degraded == 0
-    assert pipeline.counters.rejected == {'laser_lost': 4}
+    assert (pipeline.counters.degraded, pipeline.counters.rejected) == (0, {'laser_lost': 4})
 
 
 @pytest.mark.parametrize('psd', [1, 2])
@@ -71,8 +69,7 @@ def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
     full = by_block[9]
     for block in range(10, 30):
         e = by_block[block]
-        assert e.solver == 'one_psd'
-        assert e.theta == (full.theta if rule == 'hold' else 0.0)
+        assert (e.solver, e.theta) == ('one_psd', full.theta if rule == 'hold' else 0.0)
         # What is claimed holds: the error is within four of its standard deviations.
         error = np.array([e.dx - POSE[0], e.dy - POSE[1], e.theta - POSE[2]])
         covariance = np.reshape(e.covariance, (3, 3))
@@ -82,8 +79,7 @@ def test_translation_follows_rule_after_laser_loss(psd: int, rule: str) -> None:
     assert by_block[30].solver == 'exact'
     # What a block shows of motion differs from block to block, and with it the covariance, by a few per cent.
     np.testing.assert_allclose(by_block[30].covariance, full.covariance, rtol=0.1)
-    assert pipeline.counters.degraded == 20
-    assert pipeline.counters.rejected == {}
+    assert (pipeline.counters.degraded, pipeline.counters.rejected) == (20, {})
     statuses = [s.status for s in spots(records)]
     assert statuses[10:30] == [BlockStatus.LASER_LOST] * 20
     loads = {r.t_ns for r in records if isinstance(r, TipLoad)}
@@ -201,8 +197,7 @@ def test_degraded_rule_change_applies_from_next_block() -> None:
     first = primaries(records_of(pipeline, counts[: 10 * SIZE]))
     change = pipeline.change({'degraded': 'zero'})
     second = primaries(records_of(pipeline, counts[10 * SIZE :], 10 * SIZE))
-    assert sorted(first) == [0, 1, 2, 3, 4]
-    assert sorted(second) == list(range(10, 20))
+    assert (sorted(first), sorted(second)) == ([0, 1, 2, 3, 4], list(range(10, 20)))
     assert change.values == (('degraded', 'zero'),)
 
 

@@ -39,8 +39,7 @@ def test_stamps_are_within_50_us_after_three_minutes(skew: float) -> None:
     assert error.std() < 50_000
     # What is left is the least delay of the line, which no one-way clock can see.
     assert 200_000 - 50_000 < error.mean() < 450_000
-    assert clock.state().skew_ppm == pytest.approx(-skew, abs=2.0)
-    assert clock.resets == 0
+    assert (clock.state().skew_ppm, clock.resets) == (pytest.approx(-skew, abs=2.0), 0)
 
 
 @pytest.mark.slow
@@ -70,8 +69,7 @@ def test_a_clock_that_jumps_is_laid_anew_and_counted(device_us: int, host_ms: in
     clock = ClockMap()
     observe_usb(clock, 20, 0.0, 4)
     assert clock.observe(device_us, host_ms * MS)
-    assert clock.resets == 1
-    assert clock.state().residual_ns == 0.0
+    assert (clock.resets, clock.state().residual_ns) == (1, 0.0)
     assert clock.to_host_ns(np.array([device_us], np.int64))[0] == host_ms * MS
 
 
@@ -148,10 +146,8 @@ def test_the_last_five_minutes_count_and_no_more() -> None:
         clock.observe(100_000 * k, 100 * MS * k + 200_000 + late)
         clock.to_host_ns(np.array([100_000 * k], np.int64))
         if k == change:
-            assert clock.state().points == 300
-            assert clock.state().skew_ppm == pytest.approx(0.0, abs=1e-3)
-    assert clock.state().points == 300
-    assert clock.state().skew_ppm == pytest.approx(50.0, abs=1e-3)
+            assert (clock.state().points, clock.state().skew_ppm) == (300, pytest.approx(0.0, abs=1e-3))
+    assert (clock.state().points, clock.state().skew_ppm) == (300, pytest.approx(50.0, abs=1e-3))
 
 
 @pytest.mark.parametrize('up_us', [0, 3_600_000_000])
@@ -200,8 +196,7 @@ def test_a_line_that_drains_steps_by_two_milliseconds(early_ns: int, late_share:
 
 def test_a_map_that_was_shown_nothing_is_the_identity() -> None:
     clock = ClockMap()
-    assert clock.state() == ClockState(0.0, 0, 0.0, 0, 0, None)
-    assert clock.host_ns(7) == 7000
+    assert (clock.state(), clock.host_ns(7)) == (ClockState(0.0, 0, 0.0, 0, 0, None), 7000)
     clock.observe_reply(7, 5000, 6000)
     assert clock.state().round_trip_ns is None
     clock.observe(5, 123_456)
@@ -301,8 +296,7 @@ def test_a_clock_whose_jump_is_known_goes_on_as_one_without() -> None:
             jumped.shift(by_us, us - 1)
         plain.observe(us, host)
         jumped.observe(us + by_us, host)
-        assert jumped.host_ns(us + by_us) == plain.host_ns(us)
-        assert jumped.state().skew_ppm == plain.state().skew_ppm
+        assert (jumped.host_ns(us + by_us), jumped.state().skew_ppm) == (plain.host_ns(us), plain.state().skew_ppm)
 
 
 def test_lower_line_is_closest_of_lines_below_points() -> None:

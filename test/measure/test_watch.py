@@ -122,13 +122,11 @@ def test_a_bump_is_reported_with_its_time_channel_and_size(way: float) -> None:
     fed = Fed()
     fed.load(0.0, 0.0)
     fed.run(10.0, REST)
-    assert fed.watch.alarms == 0
-    assert fed.watch.state == 'readings, base line and load'
+    assert (fed.watch.alarms, fed.watch.state) == (0, 'readings, base line and load')
     fed.run(6.0, REST + way * X1)
     alarm = fed.watch.alarm
     assert alarm is not None
-    assert alarm.channel == 'x1'
-    assert alarm.shift == pytest.approx(5e-6 * way, abs=0.3e-6)
+    assert (alarm.channel, alarm.shift) == ('x1', pytest.approx(5e-6 * way, abs=0.3e-6))
     assert alarm.since_ns / 1e9 == pytest.approx(10.0, abs=0.6 if way > 0.0 else 0.2)
     assert alarm.observed_ns / 1e9 - 10.0 < 6.0
     # Of two means of four windows, which are means of 25 blocks.
@@ -257,8 +255,7 @@ def test_without_a_known_load_only_the_base_line_is_watched() -> None:
     fed = Fed()
     fed.run(8.0, under(0.0, 0.0))
     fed.run(8.0, under(20.0, -30.0))
-    assert fed.watch.state == 'base line only: no load is known'
-    assert fed.watch.alarms == 0
+    assert (fed.watch.state, fed.watch.alarms) == ('base line only: no load is known', 0)
     fed.run(8.0, under(20.0, -30.0) + np.array([4e-6, 4e-6, -4e-6, -4e-6]))
     assert fed.watch.alarm is not None
     assert fed.watch.alarm.channel == 'base line of psd_1 and psd_2'

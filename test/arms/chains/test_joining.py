@@ -38,8 +38,7 @@ def test_a_line_is_interpolated_at_the_stamps_of_the_first_link() -> None:
     for j in got:
         for tip in j.tips:
             assert tip.pose == pytest.approx(np.array([1, 2, 3]) * 1e-3 * j.t_ns / BLOCK_NS, rel=1e-12)
-    assert joiner.joined == 8
-    assert joiner.missing == [0, 0, 0]
+    assert (joiner.joined, joiner.missing) == (8, [0, 0, 0])
     u = 13 / 20
     assert np.diag(got[-1].tips[1].covariance) == pytest.approx(
         (u**2 + (1 - u) ** 2) * np.array([4e-12, 9e-12, 1e-10]), rel=1e-9
@@ -73,8 +72,7 @@ def test_lost_block_of_other_link_leaves_gap_beside_it() -> None:
     got = run(joiner, {0: every(0, 10), 1: times})
     assert [j.t_ns // BLOCK_NS for j in got if j.missing] == [4, 5]
     assert all(j.missing == (1,) and j.tips == () for j in got if j.missing)
-    assert joiner.missing == [0, 2]
-    assert joiner.joined == 7
+    assert (joiner.missing, joiner.joined) == ([0, 2], 7)
     # Three blocks that are not neighbours tell nothing of a curve.
     (after,) = (j.tips[1] for j in got if j.t_ns == 6 * BLOCK_NS)
     u = 13 / 20
@@ -93,8 +91,7 @@ def test_ended_link_is_dropped_and_joins_on_return() -> None:
 def test_lost_blocks_of_first_link_are_counted_later() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
     run(joiner, {0: every(0, 5) + every(8 * BLOCK_NS, 5), 1: every(7_000_000, 13)})
-    assert joiner.missing == [3, 0]
-    assert joiner.joined == 9
+    assert (joiner.missing, joiner.joined) == ([3, 0], 9)
 
 
 def test_a_clock_that_goes_back_begins_anew() -> None:
@@ -102,8 +99,7 @@ def test_a_clock_that_goes_back_begins_anew() -> None:
     run(joiner, {0: every(10**12, 5), 1: every(10**12 + 7_000_000, 5)})
     got = run(joiner, {0: every(0, 5), 1: every(7_000_000, 5)})
     assert [j.t_ns // BLOCK_NS for j in got if j.tips] == [1, 2, 3, 4]
-    assert joiner.missing == [0, 0]
-    assert joiner.joined == 8
+    assert (joiner.missing, joiner.joined) == ([0, 0], 8)
 
 
 def test_two_estimates_closer_than_a_block_miss_none() -> None:
@@ -145,8 +141,7 @@ def test_each_link_has_its_own_rig(tmp_path: Path) -> None:
     file = read_chain(tmp_path / 'chain.yaml', {'record': True, 'bag_dir': 'bags'}, 'end_force')
     a, b = file.chain.links
     assert (a.length, a.slope_ratio, a.slope_ratio_sd) == (0.4, 1.7, 0.2)
-    assert file.rigs[0].acquisition.port == '/dev/a'
-    assert file.rigs[0].estimator.solver == 'wls'
+    assert (file.rigs[0].acquisition.port, file.rigs[0].estimator.solver) == ('/dev/a', 'wls')
     assert [rig.acquisition.bag_dir for rig in file.rigs] == ['bags/a', 'bags/b']
     assert all(rig.acquisition.record for rig in file.rigs)
     assert np.allclose(b.axis, [0, 1, 0])

@@ -176,8 +176,7 @@ def test_it_begins_where_the_joints_are() -> None:
     with pytest.raises(ConfigError, match='the position of elbow is not known'):
         path_shaper.shape(0, without_start, standing({'shoulder': 0.3}))
     shaped = path_shaper.shape(0, without_start, standing({'shoulder': 0.3, 'elbow': 0.2, 'wrist': 0.0}))
-    assert shaped.times[0] == 0.0
-    assert shaped.states[0].tolist() == [[0.3, 0.2], [0.0, 0.0]]
+    assert (shaped.times[0], shaped.states[0].tolist()) == (0.0, [[0.3, 0.2], [0.0, 0.0]])
     # A joint of which nobody tells anything is not moved, wherever a trajectory says that it is.
     with pytest.raises(ConfigError, match='the position of shoulder is not known'):
         TrajectoryShaper(ZV).shape(0, moved(2), {})
@@ -369,8 +368,7 @@ def test_first_point_slightly_off_path_makes_no_step() -> None:
 
 
 def test_a_trajectory_begins_when_it_has_arrived() -> None:
-    assert start_of(10 * S, 0, 0.1) == round(10.1 * S)
-    assert start_of(10 * S, 10 * S - 1, 0.1) == round(10.1 * S)
+    assert (start_of(10 * S, 0, 0.1), start_of(10 * S, 10 * S - 1, 0.1)) == (round(10.1 * S), round(10.1 * S))
     assert start_of(10 * S, 12 * S, 0.1) == 12 * S
     with pytest.raises(ConfigError, match='its stamp is 2 s old, must be at most 1 s'):
         start_of(10 * S, 8 * S, 0.1)

@@ -299,8 +299,7 @@ def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
     assert noisy.segment() == block
     assert noisy.sums() == (1.0, 2.0, 3.0, 4.0)
     noisy.set_segment(block)
-    assert noisy.sums() == (0.0,) * 4
-    assert noisy.buffered == len(block) + 4
+    assert (noisy.sums(), noisy.buffered) == ((0.0,) * 4, len(block) + 4)
     pipeline = Pipeline(load_rig())
     with pytest.raises(ValueError, match='17 numbers for each tone'):
         pipeline.estimator.load_state_dict({'state.noise': (0.0,) * 6, VIBRATION: (0.1, 1.0)})

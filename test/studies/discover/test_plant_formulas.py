@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 from scipy.stats import t as student
@@ -510,6 +511,22 @@ def test_noise_of_a_plant_is_nothing_missing() -> None:
     search = Search(PlantComparison(steel(0.0)), lambda *_: cast(Any, None))
     for p, passes in ((0.0099, True), (0.0101, False)):
         assert search.may_pass(Score(cast(Any, None), 1e3, 1, p, np.zeros(1))) is passes
+
+
+@pytest.mark.parametrize('third', [0.0, 0.05, 0.15])
+def test_second_resonance_is_named_and_no_cubic(third: float) -> None:
+    """Of a machine that responds at 1.3 Hz as it is described, and at 4.1 and 7.9 Hz, in parts of 6 s."""
+    rng = np.random.default_rng(7)
+    pushes = [np.repeat(rng.standard_normal(60), 5) for _ in range(4)]
+    poles = [np.exp(0.02 * 2.0 * np.pi * f * complex(-z, 1.0)) for f, z in ((1.3, 0.03), (4.1, 0.02), (7.9, 0.02))]
+    modes = [[lfilter([0.0, abs(1.0 - p) ** 2], np.poly([p, p.conj()]).real, u)[None] for u in pushes] for p in poles]
+    noise = [0.01 * rng.standard_normal((1, 300)) for _ in pushes]
+    observed = [0.3 * b + third * c + n for b, c, n in zip(modes[1], modes[2], noise, strict=True)]
+    shown = {'second': modes[1], 'cubic': [a**3 for a in modes[0]], 'square': [a**2 for a in modes[0]]}
+    given: dict[str, Any] = {'channels': ('tip',), 'units': ('mm',), 'period': 0.02, 'cases': tuple('abcd')}
+    answer = discover_in(Pictures(observed, shown, done={'push': pushes}, **given))
+    assert [e.name for e in answer.effects] == ['second']
+    assert bool(answer.unknown) is (third > 0.0)
 
 
 @pytest.mark.parametrize('size', [0.4, 0.0])
