@@ -35,7 +35,8 @@ def test_info_says_what_is_in_it(bag: Path, capsys: pytest.CaptureFixture[str]) 
     assert main(['info', str(bag), '--json']) == 0
     tree = json.loads(capsys.readouterr().out)
     assert (tree['samples'], tree['lost'], tree['blocks'], tree['flagged']) == (1182, 18, 60, 9)
-    assert (tree['duration_s'], tree['sample_rate_hz']) == (pytest.approx(1.2), pytest.approx(1000.0))
+    assert tree['duration_s'] == pytest.approx(1.2)
+    assert tree['sample_rate_hz'] == pytest.approx(1000.0)
     assert (tree['device_hello'], tree['changed_parameters']) == (HELLO, {'sum_min': 1.5})
     assert tree['topics']['/psd/samples'] == 60
     assert tree['complete'] is True
@@ -125,7 +126,8 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
     assert main(['info', str(tmp_path / 'run'), '--json']) == 0
     tree = json.loads(capsys.readouterr().out)
     assert open_recording(tmp_path / 'run').sample_rate_hz == pytest.approx(999.0, rel=1e-4)
-    assert (tree['sample_rate_hz'], tree['lost']) == (pytest.approx(1000.0, rel=3e-4), 0)
+    assert tree['sample_rate_hz'] == pytest.approx(1000.0, rel=3e-4)
+    assert tree['lost'] == 0
 
 
 def test_only_recorded_parameters_are_reported_as_defaults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

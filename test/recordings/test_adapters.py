@@ -241,8 +241,7 @@ def test_seq_is_recorded_modulo_2_to_32_with_high_part() -> None:
     start = 2**32 // 20
     (m,) = to_messages(block(start, first_index=start))
     _, points = point_cloud2.to_points(m.fields)
-    assert points['seq'][[0, -1]].tolist() == [2**32 - 16, 3]
-    assert points['seq_high'][[0, -1]].tolist() == [0, 1]
+    assert (points['seq'][[0, -1]].tolist(), points['seq_high'][[0, -1]].tolist()) == ([2**32 - 16, 3], [0, 1])
     assert [f['name'] for f in m.fields['fields']] == ['seq', 'dt', *CHANNELS, 'flags', 'seq_high']
     # It is enough that the last number is above.
     (m,) = to_messages(block(start, lost=(17, 18, 19), first_index=start))

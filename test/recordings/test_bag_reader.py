@@ -67,8 +67,7 @@ def test_every_record_comes_back(complete_bag: Path) -> None:
     assert recording.marks() == [r for r in records if isinstance(r, Mark)]
     references = [r for r in records if isinstance(r, ReferencePose)]
     np.testing.assert_allclose(recording.references(), references, rtol=1e-15)
-    assert recording.parameters == {**load_rig().values, 'sum_min': 1.5}
-    assert recording.hello == HELLO
+    assert (recording.parameters, recording.hello) == ({**load_rig().values, 'sum_min': 1.5}, HELLO)
     assert recording.version == psd_deflection.__version__
     assert recording.complete
     assert not recording.warnings
@@ -238,8 +237,7 @@ def test_a_restart_that_makes_no_sense_is_none(tmp_path: Path, value: str) -> No
     changed = f'{{"device.restart": {value}}}'
     text = f'{{"version": "1", "t_ns": 0, "block": 0, "parameters": {{}}, "changed": {changed}}}'
     recording = open_recording(with_state(tmp_path, text))
-    assert recording.restarts == set()
-    assert recording.lost(0, 9, 8) == 2
+    assert (recording.restarts, recording.lost(0, 9, 8)) == (set(), 2)
 
 
 def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
@@ -590,8 +588,7 @@ def test_of_several_rigs_one_is_chosen(zeroed: Path, tmp_path: Path, capsys: Cap
 def test_remapped_samples_are_found_and_no_foreign_cloud(zeroed: Path, tmp_path: Path) -> None:
     bag = passed_on(zeroed, tmp_path / 'remapped', lambda topic: '/raw/psd/samples' if topic == SAMPLES else topic)
     recording = open_recording(bag)
-    assert recording.namespace == '/raw'
-    assert recording.topics() == open_recording(zeroed).topics()
+    assert (recording.namespace, recording.topics()) == ('/raw', open_recording(zeroed).topics())
     assert rigs(bag) == rigs(zeroed)
     foreign = tmp_path / 'foreign.mcap'
     with foreign.open('wb') as stream:

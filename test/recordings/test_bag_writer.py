@@ -81,8 +81,7 @@ def test_metadata_yaml_is_what_rosbag2_writes(tmp_path: Path) -> None:
             'type_description_hash',
         ]
         (qos,) = topic['topic_metadata']['offered_qos_profiles']
-        assert qos['history'] == 'keep_last'
-        assert qos['deadline'] == {'sec': 9223372036, 'nsec': 854775807}
+        assert (qos['history'], qos['deadline']) == ('keep_last', {'sec': 9223372036, 'nsec': 854775807})
     with (folder / 'run_0.mcap').open('rb') as f:
         summary = make_reader(f).get_summary()
     assert summary is not None

@@ -49,8 +49,7 @@ def test_a_plain_file_is_read(tmp_path: Path) -> None:
     assert [(b.index, len(b.seq)) for b in blocks] == [(0, 20), (1, 20), (2, 5)]
     np.testing.assert_array_equal(blocks[2].t_ns, np.arange(40, 45) * STEP)
     np.testing.assert_array_equal(blocks[0].volts[0], np.array([1.5, -2.25, 5, 0.5, 0, 5], np.float32))
-    assert recording.sample_rate_hz == 1000.0
-    assert recording.topics() == {'/psd/samples': 3}
+    assert (recording.sample_rate_hz, recording.topics()) == (1000.0, {'/psd/samples': 3})
     assert (recording.parameters, recording.hello, recording.complete) == ({}, None, True)
     assert recording.estimates() == {}
 
@@ -124,10 +123,8 @@ def test_samples_with_all_columns_come_back(tmp_path: Path) -> None:
     put_all(sink, [*loads, *references, *temperatures, TipLoad(T0, 9.0, 9.0, 9.0), *blocks])
     recording = open_recording(tmp_path / 'a.csv')
     np.testing.assert_array_equal(recording.samples['seq'], np.concatenate([b.seq for b in blocks]))
-    assert recording.loads() == loads
-    assert recording.references() == references
-    assert recording.temperatures() == temperatures
-    assert recording.topics()['/reference/deflection'] == 2
+    assert (recording.loads(), recording.references()) == (loads, references)
+    assert (recording.temperatures(), recording.topics()['/reference/deflection']) == (temperatures, 2)
 
 
 def test_records_between_two_samples_go_to_the_later_row(tmp_path: Path) -> None:

@@ -315,8 +315,7 @@ def marked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_marks_are_read_and_belong_to_their_part(marked: Path) -> None:
     full = psd_deflection.open(marked)
-    assert full.marks() == MARKS
-    assert full.crop(0.6, 1.2).marks() == MARKS[1:2]
+    assert (full.marks(), full.crop(0.6, 1.2).marks()) == (MARKS, MARKS[1:2])
     assert full.topics()[MARK] == 3
 
 

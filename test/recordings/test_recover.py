@@ -335,8 +335,7 @@ def test_a_damaged_chunk_costs_itself_only(tmp_path: Path, complete: bytes) -> N
     (tmp_path / 'a.mcap').write_bytes(spoiled)
     recording = BagRecording(tmp_path / 'a.mcap')
     indices = [b.index for b in recording.blocks()]
-    assert indices[:24] == list(range(24))
-    assert indices[-1] == 119
+    assert (indices[:24], indices[-1]) == (list(range(24)), 119)
     assert 120 - len(indices) in range(24, 27)
     assert not recording.complete
     assert f'the chunk at byte {at} is damaged' in recording.warnings[0]

@@ -35,8 +35,7 @@ def test_frames_without_an_answer_are_counted_not_read(tmp_path: Path) -> None:
     assert references.t_ns.tolist() == [100_000, 33_400_000]
     assert references.poses.tolist() == [[0.0, 0.0, 0.0], [1e-3, 2e-3, 0.01]]
     assert references.sd is not None
-    assert references.sd[1].tolist() == [1e-5, 2e-5, 1e-4]
-    assert references.rejected == {'blurred': 2}
+    assert (references.sd[1].tolist(), references.rejected) == ([1e-5, 2e-5, 1e-4], {'blurred': 2})
 
 
 def test_a_stage_needs_four_columns_only(tmp_path: Path) -> None:

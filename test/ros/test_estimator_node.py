@@ -181,8 +181,7 @@ def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any
     values = peer.call(GetParameters, '/estimator/get_parameters', request).values
     held = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=True)}
     held = {name: list(value) if isinstance(value, array.array) else value for name, value in held.items()}
-    assert held['psd_1.axes'] == ['-y', '+x']
-    assert held['psd_2.axes'] == ['+x', '+y']
+    assert (held['psd_1.axes'], held['psd_2.axes']) == (['-y', '+x'], ['+x', '+y'])
     assert first.end() == 0, first.lines
     # As ros2 param dump writes it, which leaves a y without quotes.
     dump = tmp_path / 'dump.yaml'

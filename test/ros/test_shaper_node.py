@@ -96,11 +96,9 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
 
     peer.until(answered, 'the shaped trajectory')
     shaped = heard[0]
-    assert shaped.joint_names == list(NAMES)
-    assert shaped.header.frame_id == 'arm'
+    assert (shaped.joint_names, shaped.header.frame_id) == (list(NAMES), 'arm')
     assert stamp(shaped) >= begun + 100_000_000
-    assert list(shaped.points[0].positions) == START.tolist()
-    assert list(shaped.points[-1].positions) == END.tolist()
+    assert (list(shaped.points[0].positions), list(shaped.points[-1].positions)) == (START.tolist(), END.tolist())
     times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in shaped.points]
     arrived = checked(NAMES, times, [[p.positions, p.velocities, p.accelerations] for p in shaped.points])
     assert arrived.duration == pytest.approx(MOVE_S + 0.0834, abs=1e-3)

@@ -199,8 +199,7 @@ def test_plate_follows_estimate_and_dot_stays_on_beam() -> None:
 
 def test_a_lost_dot_is_taken_away() -> None:
     now = by_name(moving(RIG, bent_by(), spots((0.0, 0.0, math.nan, 0.0), (0.1, 5.0)), 10.0))
-    assert now['dot', 1].action == Marker.DELETE
-    assert now['dot', 2].action == Marker.DELETE
+    assert (now['dot', 1].action, now['dot', 2].action) == (Marker.DELETE, Marker.DELETE)
     assert now['psd', 1].action == now['link', 0].action == Marker.ADD
 
 

@@ -216,8 +216,7 @@ def test_a_replay_hands_on_its_alarms(server: Server, tmp_path: Path, capsys: py
     argv = ['replay', str(path), '--watch', '--watch-command', python(KEEP, str(output)), '--watch-webhook', server.url]
     assert main(argv) == 0
     reported = json.loads(output.read_text())
-    assert reported == json.loads(server.got[0])
-    assert reported['recording'] == str(path)
+    assert (reported, reported['recording']) == (json.loads(server.got[0]), str(path))
     assert reported['text'].partition(': ')[2] in capsys.readouterr().out
     assert main(['replay', str(path), '--watch-command', 'true']) == 2
     assert main(['replay', str(path), '--watch', '--watch-command', '/nowhere/notify']) == 2

@@ -30,8 +30,7 @@ def host_of(watched: ClockWatch, t_us: int) -> int:
 
 def test_only_newest_sample_of_read_sets_the_clock(watched: ClockWatch) -> None:
     assert not watched.newest([sample(0), sample(1), BadFrame('x', 3), sample(2), BadFrame('y', 1)], BOOT + 2 * MS)
-    assert host_of(watched, 0) == BOOT
-    assert host_of(watched, 2000) == BOOT + 2 * MS
+    assert (host_of(watched, 0), host_of(watched, 2000)) == (BOOT, BOOT + 2 * MS)
 
 
 def test_a_read_without_a_sample_says_nothing(watched: ClockWatch) -> None:
@@ -116,8 +115,7 @@ def test_an_answer_to_a_ping_bounds_the_delay_not_across_a_jump(
     watched.newest([sample(0)], BOOT + 3 * MS)
     watched.torn(0, 0)
     watched.reply(answered_us, BOOT + 3 * MS, BOOT + 4 * MS)
-    assert watched.torn(1, next_us) == (found_ns is None)
-    assert watched.state().round_trip_ns == found_ns
+    assert (watched.torn(1, next_us), watched.state().round_trip_ns) == (found_ns is None, found_ns)
 
 
 @pytest.mark.parametrize(('claimed_us', 'believed'), [(100_400, True), (145_400, False), (55_000, False)])

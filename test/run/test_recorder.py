@@ -196,8 +196,7 @@ def test_the_oldest_file_is_deleted_where_that_was_asked_for(
     disk.free = 150 * MB
     run.put(1)
     assert 'deleted, the disk has 150 MB left' in run.heard()
-    assert run.stop() == run.folder
-    assert run.recorder.files_deleted == 1
+    assert (run.stop(), run.recorder.files_deleted) == (run.folder, 1)
     assert mine.exists()
     assert run.indices() == list(range(50, CHECK_EVERY))
     with Reader(run.folder) as reader:
@@ -210,8 +209,7 @@ def test_files_older_than_bag_keep_are_deleted(tmp_path: Path) -> None:
     assert run.heard().endswith('_0.mcap: deleted, it ended more than bag_keep = 1.39 s ago')
     run.stop()
     # Files of ten blocks: a seventh of 1.39 s is just less.
-    assert run.recorder.files_deleted == 18
-    assert run.indices() == list(range(180, CHECK_EVERY))
+    assert (run.recorder.files_deleted, run.indices()) == (18, list(range(180, CHECK_EVERY)))
     assert open_recording(run.folder).warnings == []
 
 
@@ -279,8 +277,7 @@ def test_flushed_messages_survive_a_missing_end(tmp_path: Path) -> None:
 
 def test_a_recording_stays_in_its_folder(tmp_path: Path) -> None:
     run = Run(rig_for(tmp_path))
-    assert run.folder.parent == tmp_path / 'bags'
-    assert run.start(rig_for(tmp_path)) == run.folder
+    assert (run.folder.parent, run.start(rig_for(tmp_path))) == (tmp_path / 'bags', run.folder)
     run.stop()
 
 

@@ -152,8 +152,7 @@ def test_what_is_still_to_be_kept_is_kept_at_the_end(tmp_path: Path) -> None:
     chain = Chain(tmp_path / 'deep' / 'below')
     chain.feed(0.2)
     chain.bump()
-    assert chain.watcher.watch.alarms == 1
-    assert chain.watcher.close(60.0) == ''
+    assert (chain.watcher.watch.alarms, chain.watcher.close(60.0)) == (1, '')
     assert chain.watcher.folder is not None
     assert 13.0 < read_observation(chain.watcher.folder).duration < 15.0
 
@@ -162,8 +161,7 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     chain = Chain(None)
     chain.bump()
-    assert chain.watcher.watch.alarms == 1
-    assert chain.watcher.close(1.0) == ''
+    assert (chain.watcher.watch.alarms, chain.watcher.close(1.0)) == (1, '')
     assert chain.watcher.folder is None
     assert not list(tmp_path.iterdir())
     assert len(chain.logged) == 1
@@ -238,8 +236,7 @@ def test_run_kept_of_full_memory_replays_as_computed(tmp_path: Path) -> None:
     assert any('watch_memory' in line for line in chain.logged)
     chain.feed(3.0)
     chain.feed(6.0, BUMP)
-    assert chain.watcher.watch.alarms == 1
-    assert chain.watcher.close(60.0) == ''
+    assert (chain.watcher.watch.alarms, chain.watcher.close(60.0)) == (1, '')
     assert chain.watcher.folder is not None
     assert chain.watcher.held_bytes == 0
     recording = open_recording(chain.watcher.folder)

@@ -164,7 +164,7 @@ def isolable(
     if the loads are too short for a search.
     """
     counts = RigSimulator(rig).step(loads).counts
-    volts = Wiring.from_rig(rig).to_psds(counts * rig.converter.volts_per_count)
+    volts = Wiring.from_rig(rig).to_psds(counts.astype(np.float64) * rig.converter.volts_per_count)
     planned = Observation('planned', rig, volts, loads)
     machine = RecordedRig.of([planned], rig, without, None, progress)
     problem = Problem.of(machine, 0, progress, np.random.default_rng(0))

@@ -509,7 +509,8 @@ def test_a_fit_of_more_than_a_minute_begins_anew() -> None:
         first, later = 0.02 * np.clip([t - 1.0, t - 64.0], 0.0, 0.5)
         response.add(t, np.array([first + 0.5 * later]), np.array([first + later]), 0.01)
         slopes.append(response.slopes[0])
-    assert (slopes[150], slopes[-1]) == (pytest.approx(1.0, abs=1e-6), pytest.approx(0.5, abs=1e-6))
+    assert slopes[150] == pytest.approx(1.0, abs=1e-6)
+    assert slopes[-1] == pytest.approx(0.5, abs=1e-6)
 
 
 def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:

@@ -120,8 +120,7 @@ def test_many_poses_are_tied_one_by_one() -> None:
 def test_the_geometry_is_that_of_the_rig_file() -> None:
     values = {'psd_1.height': 0.02, 'psd_2.height': -0.01, 'psd_1.zero': [1e-3, 2e-3], 'link.length': 0.4}
     geometry = Geometry.from_rig(load_rig(overrides={**values, 'link.slope_ratio': 1.4, 'psd_2.center': [-0.09, 0.01]}))
-    assert geometry.heights.tolist() == [0.02, -0.01]
-    assert geometry.centers.tolist() == [[0.0, 0.07], [-0.09, 0.01]]
+    assert (geometry.heights.tolist(), geometry.centers.tolist()) == ([0.02, -0.01], [[0.0, 0.07], [-0.09, 0.01]])
     assert geometry.zeros.tolist() == [[1e-3, 2e-3], [0.0, 0.0]]
     assert (geometry.link_length, geometry.slope_ratio) == (0.4, 1.4)
 

@@ -154,8 +154,7 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
     assert len(psd_deflection.replay(tmp_path / 'a.mcap').dy) == len(observed.dy)
     assert np.any(psd_deflection.replay(tmp_path / 'a', RIG).dy != observed.dy)
     (carried,) = effects_of_rig(load_rig(model))
-    assert carried.values == {'c1': 4.0}
-    assert carried.effect.law == active.effect.law
+    assert (carried.values, carried.effect.law) == ({'c1': 4.0}, active.effect.law)
     # A rig file that names it alone does not have it, and is told where it would be.
     assert main(['replay', str(tmp_path / 'a'), '--params-file', str(by_hand)]) == 3
     assert f'(one of your own is yielding.py or yielding.yaml in {elsewhere}, see {FOLDERS})' in capsys.readouterr().err

@@ -68,8 +68,7 @@ def test_appendix_d_branch_and_all(golden: Any, case: str) -> None:
     dots = golden.dots(case)
     got = appendix_d_iterative(tuple(1e3 * m for m in dots), tuple((1e3 * geometry.zeros).ravel().tolist()))
     want = golden.cases[case]['appD_raw_mm_deg_cw']
-    assert got.branch == golden.cases[case]['appD_branch']
-    assert got.angle_of_twist == want[2]
+    assert (got.branch, got.angle_of_twist) == (golden.cases[case]['appD_branch'], want[2])
     np.testing.assert_allclose(got[:3], want, rtol=0.0, atol=1e-9)
     solver = make_solver('appendix_d', geometry)
     solution = solver.solve(dots, EQUAL)

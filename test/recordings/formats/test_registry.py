@@ -59,8 +59,7 @@ def test_poses_of_a_camera_are_references_when_they_are_read(tmp_path: Path, nam
     file.put(2 * 10**9, None, 'no target')
     file.close()
     references = read_references(path)
-    assert references.t_ns.tolist() == [10**9]
-    assert references.poses.tolist() == [[1e-6, 2e-6, 3e-6]]
+    assert (references.t_ns.tolist(), references.poses.tolist()) == ([10**9], [[1e-6, 2e-6, 3e-6]])
 
 
 def test_a_file_of_another_name_is_known_by_its_content(tmp_path: Path) -> None:

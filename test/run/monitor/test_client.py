@@ -36,12 +36,9 @@ def nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: Capsys) -> None:
     serving = serve()
-    assert main(['zero']) == 0
-    assert main(['record']) == 0
-    assert main(['record', 'stop']) == 0
-    assert main(['load', '0', '-10', '0.5']) == 0
-    assert main(['load', '--add', '-1e1', '0', '0']) == 0
-    assert main(['load', '0', '0', '1', '--ago', '3.4']) == 0
+    assert (main(['zero']), main(['record'])) == (0, 0)
+    assert (main(['record', 'stop']), main(['load', '0', '-10', '0.5'])) == (0, 0)
+    assert (main(['load', '--add', '-1e1', '0', '0']), main(['load', '0', '0', '1', '--ago', '3.4'])) == (0, 0)
     assert main(['load', '0', '0', '1', '--ago', 'step']) == 0
     assert serving.shown.agos == [0.0, 0.0, 3.4, None]
     assert main(['mark', 'bumped', 'it']) == 0
@@ -49,8 +46,7 @@ def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: Capsys
     # A zero, four loads and a mark, of the time at which this program was started.
     assert len(serving.shown.lates) == 6
     assert 0.0 < serving.shown.lates[0] < serving.shown.lates[-1]
-    assert serving.shown.zeros == 1
-    assert serving.shown.recordings == ['recordings/test', None]
+    assert (serving.shown.zeros, serving.shown.recordings) == (1, ['recordings/test', None])
     assert serving.shown.loads[:2] == [(0.0, -10.0, 0.5, False), (-10.0, 0.0, 0.0, True)]
     answers = ['unloaded dots taken', 'recording', 'recording ended', *['load noted'] * 4, 'mark: bumped it']
     assert capsys.readouterr().out.splitlines() == answers

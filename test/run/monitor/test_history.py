@@ -133,8 +133,7 @@ def test_cells_are_what_the_rows_say(
                 continue
             assert mean == pytest.approx(math.fsum(values) / len(values), rel=1e-12, abs=1e-15)
             assert (low, high) == (np.float32(min(values)), np.float32(max(values)))
-        assert view.columns['blocks'][k] == len(here)
-        assert view.columns['estimates'][k] == len(dxs)
+        assert (view.columns['blocks'][k], view.columns['estimates'][k]) == (len(here), len(dxs))
         assert view.columns['lost'][k] == sum(r.spots.lost + SIZE * r.gone for r in here)
 
 

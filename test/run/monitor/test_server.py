@@ -95,11 +95,9 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     got: list[Any] = []
     messages = listen(serving.url, lambda m: (got.append(m), more(m))[1])  # type: ignore[func-returns-value]
     hello = messages[0]['hello']
-    assert hello['columns'][:2] == ['t', 'block']
-    assert hello['active_areas'] == [[0.01, 0.01], [0.01, 0.01]]
+    assert (hello['columns'][:2], hello['active_areas']) == (['t', 'block'], [[0.01, 0.01], [0.01, 0.01]])
     assert hello['control'] is True
-    assert hello['why_no_control'] == ''
-    assert hello['spectrum_s'] == 4.0
+    assert (hello['why_no_control'], hello['spectrum_s']) == ('', 4.0)
     rows = rows_in(messages)
     assert [r[1] for r in rows] == list(range(8))
     assert {len(r) for r in rows} == {len(hello['columns'])}
@@ -107,8 +105,7 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     reported = [text for m in messages for _, text in m.get('messages', [])]
     assert reported == ['a message']
     health = next(m['health'] for m in messages if 'health' in m)
-    assert health['entries'][0]['name'] == 'acquisition'
-    assert health['sum_min'] == serving.rig.estimator.sum_min
+    assert (health['entries'][0]['name'], health['sum_min']) == ('acquisition', serving.rig.estimator.sum_min)
 
 
 def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> None:
@@ -297,8 +294,7 @@ def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> No
     listen(serving.url, lambda m: any(mark[1] == 'alarm' for mark in m.get('marks', ())))
     answer = history_of(serving, 4.0)
     assert (answer['start'], answer['width'], answer['marks_left_out']) == (START_NS / 1e9, 1.0, 0)
-    assert column(answer, 'blocks') == [50, 50, 6, 50]
-    assert column(answer, 'estimates') == [50, 50, 4, 50]
+    assert (column(answer, 'blocks'), column(answer, 'estimates')) == ([50, 50, 6, 50], [50, 50, 4, 50])
     assert column(answer, 'lost') == [0, 0, 2 * 20 + 4 * 3, 0]
     assert column(answer, 'dx_high')[0] == pytest.approx(1e-3, rel=1e-2)
     assert column(answer, 'dx_low')[0] == pytest.approx(-1e-3, rel=1e-2)
@@ -568,8 +564,7 @@ def test_a_scrape_has_counters_and_the_newest_estimate(serve: Serve, monkeypatch
     best = estimate_of(2)
     assert after[('psd_deflection_deflection_meters', 'y')] == best.dy
     assert after[('psd_deflection_deflection_sd_meters', 'x')] == pytest.approx(2e-7)
-    assert after[('psd_deflection_twist_radians',)] == best.theta
-    assert after[('psd_deflection_sum_volts', '2')] == 5.0
+    assert (after[('psd_deflection_twist_radians',)], after[('psd_deflection_sum_volts', '2')]) == (best.theta, 5.0)
     assert after[('psd_deflection_page_dropped_total',)] == 0.0
 
 

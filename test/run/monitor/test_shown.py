@@ -229,8 +229,7 @@ def test_items_beyond_the_queue_are_dropped_and_counted() -> None:
     for index in range(25):
         feed.put(spots_of(index))
         feed.put(block)
-    assert feed.waiting == 10
-    assert feed.dropped == 40
+    assert (feed.waiting, feed.dropped) == (10, 40)
     # The oldest are kept: what is shown has no hole before its end.
     assert [r.spots.index for r in feed.take() if isinstance(r, BlockResult)] == [0, 1, 2, 3, 4]
     feed.put(spots_of(99))

@@ -320,8 +320,7 @@ def test_without_a_spread_there_is_no_difference() -> None:
 
 
 def _same(tree: dict[str, Any], line: Contribution) -> None:
-    assert tree['bias'] == line.bias.tolist()
-    assert tree['covariance'] == line.covariance.tolist()
+    assert (tree['bias'], tree['covariance']) == (line.bias.tolist(), line.covariance.tolist())
     assert tree['rms'] == pytest.approx(np.sqrt(line.bias**2 + np.diag(line.covariance)).tolist())
 
 

@@ -468,8 +468,7 @@ def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
     parameter = ParameterProgress(name='n', words='a', value='b', sd_ratio=0.1, determined=True)
     tree = CalibrationProgress('reference', 2.0, (parameter,), (Need('push', ('n',)),), 'too short').tree()
     row = {'name': 'n', 'words': 'a', 'value': 'b', 'sd_ratio': 0.1, 'determined': True, 'filled': parameter.filled}
-    assert tree.pop('parameters') == [row]
-    assert tree.pop('needs') == [{'motion': 'push', 'names': ('n',)}]
+    assert (tree.pop('parameters'), tree.pop('needs')) == ([row], [{'motion': 'push', 'names': ('n',)}])
     assert tree == {'kind': 'reference', 'seconds': 2.0, 'determined': 1, 'rejected': 'too short'}
 
 

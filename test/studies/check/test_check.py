@@ -143,8 +143,7 @@ def test_a_psd_on_another_clock_is_told_first_and_no_wire(rows: int, psd: int) -
     assert abs(late.seconds - 1e-3 * rows) < 1e-4
     assert checkup.sentences()[1].startswith(f'psd_{psd}: on another clock: ')
     assert f'{abs(rows)} rows {"up" if rows > 0 else "down"}' in checkup.sentences()[1]
-    assert checkup.tree()['late'][0]['rows'] == rows
-    assert checkup.values == lines_of(every_turn()[1])
+    assert (checkup.tree()['late'][0]['rows'], checkup.values) == (rows, lines_of(every_turn()[1]))
 
 
 @pytest.mark.slow

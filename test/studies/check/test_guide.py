@@ -142,8 +142,7 @@ def test_rest_takes_2_s_and_push_and_release_0_6_s() -> None:
     guide = fed.guide
     assert fed.at(Phase.REST, 0.0)
     assert (guide.number, guide.pushes) == (0, [])
-    assert guide.moved.tolist() == [0.0] * 4
-    assert guide.prompt() == 'Leave the link alone.'
+    assert (guide.moved.tolist(), guide.prompt()) == ([0.0] * 4, 'Leave the link alone.')
     for number in range(1, 100):
         fed.feed(NOTHING)
         assert fed.at(Phase.REST, number / 100)

@@ -314,8 +314,7 @@ def test_each_difference_has_the_line_that_puts_it_right() -> None:
     other = Wiring(True, (('x', '-y'), ('y', 'x')))
     assert wirings.fix_of(wirings.Difference('channel_sign', 'x1'), other, {}) == "psd_2.axes: ['y', x]"
     assert wirings.fix_of(wirings.Difference('channel_sign', 'x2'), other, {}) == 'psd_1.axes: [x, -y]'
-    assert wirings.line('a', 0.5) == 'a: 0.5'
-    assert wirings.line('a', False) == 'a: false'
+    assert (wirings.line('a', 0.5), wirings.line('a', False)) == ('a: 0.5', 'a: false')
 
 
 STATED = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))

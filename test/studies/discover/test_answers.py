@@ -355,8 +355,7 @@ def test_the_best_of_each_variant_is_tried() -> None:
     scores = [score(name, gain, 9 if name == 'b' else 1) for name, gain in zip('aabcde', gains, strict=True)]
     assert [s.candidate.variant[0] for s in promising(scores, 3.0, 0.3, 9)] == ['a', 'c', 'b', 'e']
     assert len(promising(scores, 3.0, 0.3, 2)) == 2
-    assert promising([score('a', 0.0)], 3.0, 0.0, 9) == []
-    assert promising([], 3.0, 0.3, 9) == []
+    assert (promising([score('a', 0.0)], 3.0, 0.0, 9), promising([], 3.0, 0.3, 9)) == ([], [])
 
 
 def reported_of(alternative: str, separation: float, reverse: float, possible: float) -> Discrimination:
@@ -370,8 +369,7 @@ def test_a_plan_says_what_it_separates() -> None:
     rows = ('damping', 30.0, 40.0, 50.0), ('tip_mass', 90.0, 22.0, 99.0), ('x', 1.0, 2.0, 21.5)
     reports = tuple(reported_of(*row) for row in rows)
     plan = Plan(warm, (piece, piece, other), reports, limits, 500.0)
-    assert plan.words == 'push, 2 times; then wait, while it is warm'
-    assert plan.seconds == 9.0
+    assert (plan.words, plan.seconds) == ('push, 2 times; then wait, while it is warm', 9.0)
     assert plan.loads[:1500].tolist() == plan.loads[1500:3000].tolist() == [[0.0, -5.0, 0.0]] * 1500
     assert plan.script == ['constant:0,-5,0:3', 'constant:0,-5,0:3', 'constant:0,0,0:1', 'constant:0,0,0:2']
     assert plan.useful
@@ -575,8 +573,7 @@ def test_the_answer_is_written_as_it_is(study: Discovery) -> None:
     }
     assert tree['remaining'] == {'rms': study.gap_after, 'floors': study.floors}
     (effect,) = tree['effects']
-    assert effect['name'] == 'sensor_rotation'
-    assert effect['stage'] == 'psd'
+    assert (effect['name'], effect['stage']) == ('sensor_rotation', 'psd')
     assert effect['evidence'] == {
         'delta_bic': named.delta_bic,
         'p': named.p,
@@ -596,8 +593,7 @@ def test_the_answer_is_written_as_it_is(study: Discovery) -> None:
     (recording,) = source['recordings']
     assert recording['sha256'] == o.hashed()
     assert recording['seconds'] == pytest.approx(1.2)
-    assert recording['noise_v'] == study.workspace.noise[0].sigma.tolist()
-    assert recording['coloured'] == [False] * 6
+    assert (recording['noise_v'], recording['coloured']) == (study.workspace.noise[0].sigma.tolist(), [False] * 6)
     before, after = 1e6 * study.gap_before, 1e6 * study.gap_after
     size = trees.size_of(named)
     dx, dy, theta = (1e6 * v for v in study.moves)
@@ -623,8 +619,7 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(study: Discovery
     def description_of(*effects: NamedEffect, moves: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
         return dataclasses.replace(study, effects=effects, moves=moves).sentences()[-1]
 
-    assert description_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
-    assert description_of(lag) == not_corrected
+    assert (description_of(soft, moves=(1e-10, 1e-10, 9.9e-10)), description_of(lag)) == (right, not_corrected)
     assert description_of(soft, lag) == not_corrected
     assert description_of(rotated, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
     assert description_of(rotated, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'

@@ -84,8 +84,7 @@ def test_nothing_missing_is_the_answer_to_noise() -> None:
 def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
     assert rotated.verdict == 'effects_found'
     (effect,) = rotated.effects
-    assert effect.active.effect.name == 'sensor_rotation'
-    assert effect.active.values['psd'] == 2
+    assert (effect.active.effect.name, effect.active.values['psd']) == ('sensor_rotation', 2)
     assert abs(effect.active.values['angle'] - 0.002) < 4 * effect.sd['angle']
     assert effect.sd['angle'] < 2e-5
     assert rotated.gap_before > 4 * rotated.gap_after
@@ -164,8 +163,7 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     check_schema(tree)
     assert tree['provenance']['forward_simulations'] <= 2000
     page = (out / 'report.html').read_text()
-    assert page.count('<figure class="chart"') == 3
-    assert page.count('<svg class="matrix"') == 1
+    assert (page.count('<figure class="chart"'), page.count('<svg class="matrix"')) == (3, 1)
     model = out / 'model.yaml'
     # Without a file of the user it describes the rig, and not the machine that recorded.
     assert set(read_parameter_file(model)) == {*DESCRIPTION, *(k for k in load_rig(model).flat() if 'effects.' in k)}

@@ -109,8 +109,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
         (100.0, '% of the gap before'),
         ('N', 'rad'),
     )
-    assert ws.worded(0.1234) == '12.3 % of the gap before'
-    assert ws.worded(0.1234, '.1f') == '12.3 % of the gap before'
+    assert (ws.worded(0.1234), ws.worded(0.1234, '.1f')) == ('12.3 % of the gap before', '12.3 % of the gap before')
     assert ws.worded(math.nan) == 'not known'
     # A radian that moves something by 0.1 of the first unit.
     with_lever = Pictures(observed, {})
