@@ -14,9 +14,7 @@ import numpy as np
 from bench.rows import BY_HAND, Row, figure, keep, piped
 from psd_deflection.base.log import null_log
 
-SETTLE_S = 3.0
-TICK_S = 0.005
-WANTED = 32
+SETTLE_S, TICK_S, WANTED = 3.0, 0.005, 32
 
 
 class Still:

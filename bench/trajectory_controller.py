@@ -11,8 +11,7 @@ import numpy as np
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory
 from psd_deflection.records import FloatArray
 
-FEEDBACK_S = 0.05
-ACTION = '/joint_trajectory_controller/follow_joint_trajectory'
+FEEDBACK_S, ACTION = 0.05, '/joint_trajectory_controller/follow_joint_trajectory'
 
 
 def arriving(message: Any, names: Sequence[str]) -> tuple[float, Trajectory]:

@@ -16,8 +16,7 @@ from blind import law_forms
 
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
-RATE = 1000.0
-FINER = 5
+RATE, FINER = 1000.0, 5
 STEP = 1.0 / (RATE * FINER)
 EI = 69e9 * math.pi / 4.0 * (0.0159**4 - 0.0138**4)
 GJ = 24e9 * math.pi / 2.0 * (0.0159**4 - 0.0138**4)

@@ -22,8 +22,7 @@ from psd_deflection.rig.config import Rig, load_rig
 LENGTH = 0.585
 GIVES = (LENGTH**3 / (3.0 * EI), LENGTH**3 / (3.0 * EI), LENGTH / GJ)
 MODES = ((14.0, 0.02), (14.0, 0.02), (21.0, 0.02))
-REST = 3.0
-BLOCK = 20
+REST, BLOCK = 3.0, 20
 AXES = ('dX', 'dY', 'theta')
 KINDS = ('steps', 'chirp', 'operation', 'joint')
 UNTOLD = 'untold'  # As ``joint``, but the filter is told nothing.

@@ -22,8 +22,7 @@ from psd_deflection.records import FloatArray, IntArray
 from tools.program import Program
 
 BIN = Path(sys.executable).parent
-WINDOW = '1500x900'
-VIEWER_S = 180.0
+WINDOW, VIEWER_S = '1500x900', 180.0
 LIGHT = (255, 80, 60)
 SHARE = 5e-4
 """Minimum share of pixels in a trace's colour (measured: 2e-3); an empty viewport has a few, from its icons."""

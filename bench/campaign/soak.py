@@ -28,12 +28,8 @@ from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.arrivals import Arrival
 from tools.program import PSD_DEFLECTION, Program
 
-SKEW = 30e-6
-MS = 1_000_000
-START_S = 300.0
-SETTLED_S = 180
-ALLOWED_STD_NS = 50_000
-ALLOWED_GROWTH = 2_000_000
+SKEW, MS, START_S = 30e-6, 1_000_000, 300.0
+SETTLED_S, ALLOWED_STD_NS, ALLOWED_GROWTH = 180, 50_000, 2_000_000
 
 
 def resident(pid: int) -> int:

@@ -27,7 +27,7 @@ from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP
-from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
+from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.redundant import STAGES
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
@@ -37,6 +37,7 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.smooth import Remainder
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown, ties
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import AS_GOOD
 from psd_deflection.studies.discover.trees import (
     covariance_tree,
     effect_tree,
@@ -275,7 +276,7 @@ class RigConclusion(Conclusion):
     @property
     def model_of_law(self) -> Law | None:
         """The law by the name that it gets; None if there is none, or if it leaves too much to be a model."""
-        if self.law is None or self.law.heldout_gap > WRITTEN * self.gap_floor:
+        if self.law is None or self.law.heldout_gap > AS_GOOD * self.gap_floor:
             return None
         return self.law.adopted(self.adopted or 'law')
 

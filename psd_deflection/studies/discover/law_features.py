@@ -22,6 +22,7 @@ from psd_deflection.records import FloatArray, IntArray, channel_names, dot_name
 from psd_deflection.studies.discover.hidden import only_in
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import BATCH, LEVELS, MANY_EFFECTS, TOGGLE_COST, TRIED
 from psd_deflection.studies.loads.plate_motion import fine_means
 
 LOADS, POSE = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta')
@@ -35,9 +36,6 @@ def sought(psds: int) -> tuple[str, ...]:
 
 SOUGHT = sought(2)
 """Those of two PSDs."""
-_BATCH = 64
-LEVELS = 24
-"""Thresholds that are tried of a form that jumps there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,8 +259,8 @@ def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targe
     targets, count, k = targets or every, len(every), responses_of_rig[0].weight.shape[1] // len(every)
     listed = [t for t in listed if any(allowed(name, t) for name in targets)]
     ways = sorted({_way(name) for name in targets})
-    for start in range(0, len(listed), _BATCH):
-        batch = listed[start : start + _BATCH]
+    for start in range(0, len(listed), BATCH):
+        batch = listed[start : start + BATCH]
         # In place, and through the modes of bending and torsion.
         totals = np.zeros((3, len(batch), count, k))
         lengths = np.zeros((3, len(batch), count))
@@ -289,13 +287,6 @@ def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targe
     return out
 
 
-MOST_TIMES = 12
-REFINED = 4
-"""Of the terms with times, so many get better times."""
-TOGGLE_COST = 24.0
-"""Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
-
-
 def switchings(responses_of_rig: Sequence[Response], targets: Sequence[str] = ()) -> list[LawTerm]:
     """Terms that are on between times which the residual of the only recording shows, on ``targets``, by default all.
 
@@ -313,12 +304,12 @@ def switchings(responses_of_rig: Sequence[Response], targets: Sequence[str] = ()
             v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
             error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
             times = two_levels(error, r.power[t] * v * v, v)
-            if 0 < len(times) <= MOST_TIMES:
+            if 0 < len(times) <= TRIED:
                 term = LawTerm('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
                 places = (name, f'static_{name}') if on_link else (name,)
                 scored += score(responses_of_rig, [term], places)
     scored.sort(key=lambda s: -s.gain)
-    better = [with_better_times(responses_of_rig, s.target, s.term) for s in scored[:REFINED]]
+    better = [with_better_times(responses_of_rig, s.target, s.term) for s in scored[:MANY_EFFECTS]]
     return list({(t.of, t.times): t for t in better}.values())
 
 

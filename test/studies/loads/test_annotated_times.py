@@ -23,6 +23,7 @@ from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.alignment import aligned
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
+from psd_deflection.studies.loads.thresholds import ALIKE_S, DISTINCT_SD
 from test.studies.held_loads import RIG, answers, read
 
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
@@ -84,7 +85,7 @@ def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> annotated_
 def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], rotated: bool) -> None:
     correction = corrected(ROTATED if rotated else QUIET, annotated(late))
     assert correction is not None
-    wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > annotated_times.ALIKE_S}
+    wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
     assert {n.number: n.delay for n in correction.notes} == pytest.approx(wrong, abs=0.002)
     assert not correction.unused.any()
     assert np.count_nonzero(np.abs(correction.loads - applied()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
@@ -614,7 +615,7 @@ def test_ringing_beyond_the_noise_of_the_blocks_is_rough(share: float, rough: bo
     """Blocks of +-1 um differ by 2 um: a variance of 2 um^2, ``ROUGH`` squared of which may ring."""
     rest = 1e-6 * np.resize([[1.0, 0.0], [-1.0, 0.0]], (100, 2))
     ringing = np.arange(100) < 10
-    rest[ringing] = share * annotated_times.ROUGH * math.sqrt(2e-12) * np.repeat([[0.0, 1.0], [0.0, -1.0]], 5, axis=0)
+    rest[ringing] = share * DISTINCT_SD * math.sqrt(2e-12) * np.repeat([[0.0, 1.0], [0.0, -1.0]], 5, axis=0)
     assert annotated_times.is_rough(np.repeat(rest, 4, axis=0), np.repeat(ringing, 4), 4) is rough
 
 

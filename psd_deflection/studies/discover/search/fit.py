@@ -12,12 +12,7 @@ import numpy.typing as npt
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
-
-STEP = 0.05
-"""Step of the finite difference, in units of the parameter's scale."""
-
-STOP = 0.05
-"""A refit ends when an iteration gains less than this in chi-square."""
+from psd_deflection.studies.discover.thresholds import BOOTSTRAPS, ROUNDING, STEP, STOP
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -173,13 +168,6 @@ def refit(
     return Fit(final[count:], chi2, residual, difference, jacobian, tuple(named), bound, final[:count])
 
 
-BOOTSTRAPS = 400
-
-
-RIDGE = 1e-6
-"""Of the squared length of a signature: so little of it on the cases of a fit does not tell its size."""
-
-
 def fold_steps(
     workspace: Comparison, fit: Fit, home: bool = False
 ) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
@@ -198,9 +186,9 @@ def fold_steps(
         test = folds == fold
         jt, rt = j[test], fit.residual[test]
         f = full_f - jt.T @ jt
-        f[np.diag_indices_from(f)] += RIDGE
+        f[np.diag_indices_from(f)] += ROUNDING
         step = np.zeros(len(lengths))
-        asked = full_g - jt.T @ rt + RIDGE * away * lengths
+        asked = full_g - jt.T @ rt + ROUNDING * away * lengths
         step[free] = np.linalg.lstsq(f[np.ix_(free, free)], asked[free], rcond=1e-9)[0]
         yield test, step / lengths
 
