@@ -51,8 +51,7 @@ def main() -> None:
     blocks = parser.parse_args().blocks
     rig = load_rig()
     print(f'rms error against the simulated truth, {blocks} blocks a load case; in brackets over the Cramér–Rao bound')
-    unit = np.array([1e6, 1e6, np.degrees(1e3)])
-    worst = 0.0
+    unit, worst = np.array([1e6, 1e6, np.degrees(1e3)]), 0.0
     for name, load in CASES.items():
         error, pose = errors(rig, load, blocks)
         rms = np.sqrt((error**2).mean(axis=0))

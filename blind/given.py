@@ -47,10 +47,8 @@ def given(job: tuple[Case, str, str]) -> str:
 
 def main() -> None:
     parser = options(__doc__, jobs=1)
-    chosen = selection(parser)
-    args = parser.parse_args()
-    folder = Path(args.out)
-    cases = chosen(args)
+    chosen, args = selection(parser), parser.parse_args()
+    folder, cases = Path(args.out), chosen(args)
     print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
     jobs = [(case, str(folder / 'sealed' / f'{case.key}.json'), str(folder / 'cases')) for case in cases]
     for _ in over(given, jobs, args.jobs, 'cases'):

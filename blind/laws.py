@@ -22,8 +22,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.search.screen import SignatureBank
 
-_BANK = SignatureBank()
-STAGES = tuple(law_forms.OF_STAGE)
+_BANK, STAGES = SignatureBank(), tuple(law_forms.OF_STAGE)
 WANTED = {'stage': 0.90, 'variables': 0.90, 'gap': 0.80, 'alarm': 0.0}
 MOST_FLOORS = 1.2
 UNDER_ONE = 0.99

@@ -51,8 +51,7 @@ class Run:
 def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
     """Loads (n, 3), N, N, N m; each is held for a sample."""
     n, rest = int(seconds * RATE), int(REST * RATE)
-    out = np.zeros((n, 3))
-    most = np.array([20.0, 20.0, 2.0])
+    out, most = np.zeros((n, 3)), np.array([20.0, 20.0, 2.0])
     if kind == 'steps':
         for axis in range(3):
             at = rest

@@ -65,8 +65,7 @@ def check_poses(written: Written, recording: Recording) -> int:
     series = recording.estimates()['/link_tip/deflection_with_covariance']
     if series.covariance is None:
         raise SystemExit('FAILED: the recording has no covariance')
-    breaks = 0
-    step = float(np.median(np.diff(series.t_ns)))
+    breaks, step = 0, float(np.median(np.diff(series.t_ns)))
     gone = np.flatnonzero(np.diff(series.t_ns) > 1.5 * step)
     for i, (name, _, _, scale, _) in enumerate(POSE):
         times, counts, values = written.rows(f'tip/{name}', 'Scalars:scalars')

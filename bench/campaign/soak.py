@@ -157,8 +157,7 @@ def real_time(minutes: float) -> bool:
 def simulated_time(hours: float) -> bool:
     rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
     acquisition = Acquisition(rig, texts(lambda text: print(f'  said: {text}')))
-    pipeline = Pipeline(rig)
-    decoder = protocol.FrameDecoder()
+    pipeline, decoder = Pipeline(rig), protocol.FrameDecoder()
     decoder.feed(b'\x00')
     rng = np.random.default_rng(4)
     once_a_second = protocol.encode(hello_of('SOAK')) + protocol.encode(protocol.StatusFrame(0, 2150))

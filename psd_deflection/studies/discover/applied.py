@@ -19,7 +19,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import note_finding
 from psd_deflection.studies.discover.hidden import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.thresholds import FREE, FREE_MOMENTS, HALF, LEAST_REPORTED, PULSE, REPORTED_SD
+from psd_deflection.studies.discover.thresholds import CERTAIN_SD, HALF, LEAST_REPORTED, UNKNOWN_SD
 from psd_deflection.studies.loads.annotated_times import CorrectedNote, MeasuredLoad, shifted
 from psd_deflection.studies.loads.effective import SwayingLoad, swaying
 from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, WrongNote, find_holds, implied_loads
@@ -49,7 +49,7 @@ def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: Impli
 
 def directions(ws: Workspace, wrong: Sequence[Hold]) -> list[LoadDirection]:
     """Any load in each of ``wrong``, and the times at which it was hung and taken off if nobody noted them."""
-    free, out = np.full(3, FREE), list[LoadDirection]()
+    free, out = np.full(3, UNKNOWN_SD), list[LoadDirection]()
     for p in wrong:
         o = ws.observations[p.recording]
         out += of_hold(o, p.recording, p, free)
@@ -73,8 +73,7 @@ def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDir
     none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
     changes = [effective([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
     return [
-        LoadDirection(recording, change, FREE_MOMENTS, note, axis, effective, none)
-        for axis, change in enumerate(changes)
+        LoadDirection(recording, change, UNKNOWN_SD, note, axis, effective, none) for axis, change in enumerate(changes)
     ]
 
 
@@ -104,7 +103,7 @@ def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) 
                 if decay < HALF * usual and last - before >= first:
                     change = np.zeros_like(o.loads)
                     change[last - before, axis] = 1.0
-                    out.append(LoadDirection(recording, change, PULSE, RINGING, axis, swings=True))
+                    out.append(LoadDirection(recording, change, UNKNOWN_SD, RINGING, axis, swings=True))
     return out
 
 
@@ -131,7 +130,7 @@ def wrong_load_findings(ws: Workspace, wrong: Sequence[Hold]) -> list[Finding]:
         o = ws.observations[p.recording]
         note = WrongNote(_timed(ws, p), p.of(o.loads), o.period)
         sd = np.array([sds.get((id(p), axis), 0.0) for axis in range(3)])
-        if np.any(note.off > np.maximum(REPORTED_SD * sd, LEAST_REPORTED)):
+        if np.any(note.off > np.maximum(CERTAIN_SD * sd, LEAST_REPORTED)):
             out.append(note_finding(note, o.name))
     return out
 

@@ -37,7 +37,6 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.smooth import Remainder
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown, ties
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.thresholds import AS_GOOD
 from psd_deflection.studies.discover.trees import (
     covariance_tree,
     effect_tree,
@@ -47,6 +46,7 @@ from psd_deflection.studies.discover.trees import (
     parameters_of,
     size_of,
 )
+from psd_deflection.studies.loads.thresholds import AS_GOOD
 from psd_deflection.studies.study import GIVEN_RIG, Notify, StudyResult, described, edited_rig_file, named, warn_caller
 
 SHOWN = 1e-3

@@ -52,7 +52,7 @@ from psd_deflection.studies.discover.steps import (
     where,
     without_effect,
 )
-from psd_deflection.studies.discover.thresholds import MANY_EFFECTS, SIGNIFICANT, TURNS
+from psd_deflection.studies.discover.thresholds import MANY_EFFECTS, ROUNDS, SIGNIFICANT
 from psd_deflection.studies.loads.alignment import SKEW
 from psd_deflection.studies.loads.holds import all_free, may_be_rounded, rounded
 from psd_deflection.studies.loads.plate_motion import dots_of
@@ -96,7 +96,7 @@ def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
 
 def _refitted(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     """Return the free loads as ``fit`` asks for, and what it leaves then: never more than before."""
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         next_ws = ws.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
         next_ws = ws.refitted(fit.difference) if next_ws is ws else next_ws
         residual, difference = next_ws.residual([*next_ws.base, *fit.coefficients_with_nuisance])
@@ -334,9 +334,7 @@ def law(problem: Problem) -> Problem:
     large_gap = ws.gap(fit.difference) > SIGNIFICANT * ws.floor()
     if not (unknown_of(problem.residual, 1.0) or large_gap or coincidences(fit, ws.physics)):
         return problem
-    found_law = find_law(
-        ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.rng, problem.progress
-    )
+    found_law = find_law(ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.progress)
     if found_law is None:
         return problem
     problem = _beside(replace(problem, law=found_law), found_law)

@@ -27,7 +27,7 @@ from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.search.comparison import EQUIVALENT
 from psd_deflection.studies.discover.search.screen import Candidate, Screen, solve_observable
 from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.thresholds import ALIKE_SIGNATURES, BIC_GAIN
+from psd_deflection.studies.discover.thresholds import BIC_GAIN
 from psd_deflection.studies.study import PageSection, StudyResult
 
 FROM_READINGS = ('spectral', 'line', 'value_grid', 'value_grid_dots')
@@ -227,7 +227,8 @@ def _isolable(
         if other_choices[0].effect is not candidate.effect and len(other_choices[0].free) <= len(candidate.free)
     ]
     share, alike = max(alternatives, default=(0.0, ''))
-    apart = 1.0 - share if 1.0 - share > ALIKE_SIGNATURES else 0.0
+    # What is left of two like signatures of 32 bit is rounding.
+    apart = 1.0 - share if 1.0 - share > 100.0 * np.finfo(np.float32).eps else 0.0
     accepted = accepts(len(candidate.free))
     p = candidate.effect.parameter(candidate.free[0])
     out = Isolable(

@@ -22,8 +22,9 @@ from psd_deflection.records import FloatArray, IntArray, channel_names, dot_name
 from psd_deflection.studies.discover.hidden import only_in
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.thresholds import BATCH, LEVELS, MANY_EFFECTS, TOGGLE_COST, TRIED
+from psd_deflection.studies.discover.thresholds import BIC_GAIN, LEVELS, MANY_EFFECTS, MAX_FINE, TRIED
 from psd_deflection.studies.loads.plate_motion import fine_means
+from psd_deflection.studies.loads.thresholds import MANYFOLD
 
 LOADS, POSE = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta')
 
@@ -259,8 +260,9 @@ def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targe
     targets, count, k = targets or every, len(every), responses_of_rig[0].weight.shape[1] // len(every)
     listed = [t for t in listed if any(allowed(name, t) for name in targets)]
     ways = sorted({_way(name) for name in targets})
-    for start in range(0, len(listed), BATCH):
-        batch = listed[start : start + BATCH]
+    size = max(1, round(MANYFOLD * MAX_FINE) // len(responses_of_rig[0].error[0]))
+    for start in range(0, len(listed), size):
+        batch = listed[start : start + size]
         # In place, and through the modes of bending and torsion.
         totals = np.zeros((3, len(batch), count, k))
         lengths = np.zeros((3, len(batch), count))
@@ -371,7 +373,7 @@ def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int
     top, below = p[None, :] - p[:, None], n[None, :] - n[:, None]
     gain = np.where(below > 1e-9 * n[-1], top**2 / np.maximum(below, 1e-9 * n[-1] + 1e-300), 0.0)
     a, b = np.unravel_index(int(np.argmax(np.triu(gain, 1))), gain.shape)
-    if below[a, b] <= 0.0 or gain[a, b] < TOGGLE_COST:
+    if below[a, b] <= 0.0 or gain[a, b] < toggle_cost(len(ratio)):
         return []
     level = float(top[a, b] / below[a, b])
     for _ in range(4):
@@ -383,12 +385,18 @@ def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int
     return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
 
 
+def toggle_cost(blocks: int) -> float:
+    """Return the chi-square that each switching must gain: any of the ``blocks`` might have been its time."""
+    return 2.0 * math.log(blocks) + BIC_GAIN
+
+
 def likeliest_states(gain: FloatArray) -> IntArray:
-    """States (n,) 0 or 1 that gain most, each change for ``TOGGLE_COST``; 0 before the first."""
-    off, on = 0.0, -TOGGLE_COST
+    """States (n,) 0 or 1 that gain most, each change for :func:`toggle_cost`; 0 before the first."""
+    cost = toggle_cost(len(gain))
+    off, on = 0.0, -cost
     came = np.empty((len(gain), 2), dtype=np.int64)
     for k, g in enumerate(gain.tolist()):
-        from_on, from_off = on - TOGGLE_COST, off - TOGGLE_COST
+        from_on, from_off = on - cost, off - cost
         came[k, 0], came[k, 1] = int(from_on > off), int(on >= from_off)
         off, on = max(off, from_on), max(on, from_off) + g
     state = np.empty(len(gain), dtype=np.int64)

@@ -36,16 +36,15 @@ from psd_deflection.studies.discover.search.fit import Fit, HeldOut, heldout_gai
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.thresholds import (
     BIC_GAIN,
+    BUDGET,
     HALF,
-    LAW_BUDGET,
     LIKELY,
     MANY_EFFECTS,
-    NEAR_S,
     P_CHANCE,
     ROUNDS,
     TRIED,
 )
-from psd_deflection.studies.loads.thresholds import DISTINCT_SD, MANYFOLD, MINOR, SEVERAL
+from psd_deflection.studies.loads.thresholds import APART_S, DISTINCT_SD, MANYFOLD, MINOR, SEVERAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +144,7 @@ class LawSearch:
 
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
         self.ws, self.start, self.penalty = ws, start, penalty
-        self.last = min(ws.simulations + LAW_BUDGET, max(ws.simulations, ROUNDS * LAW_BUDGET))
+        self.last = min(ws.simulations + BUDGET, max(ws.simulations, ROUNDS * BUDGET))
         self.responses = responses(ws, start)
         self.listed = list(terms(self.responses))
         if len(ws.observations) == 1:
@@ -283,7 +282,6 @@ def find_law(
     fit: Fit,
     penalty: float,
     excess: float,
-    rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> FoundLaw | None:
     """Return the law that explains what ``fit`` leaves, or None.
@@ -292,13 +290,11 @@ def find_law(
     ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
     """
     progress('a law for what remains')
-    found_law = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
+    found_law = _law_of_the_mean(ws, null, fit, penalty, excess)
     return found_law or find_jitter(ws, fit, penalty)
 
 
-def _law_of_the_mean(
-    ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, rng: np.random.Generator
-) -> FoundLaw | None:
+def _law_of_the_mean(ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float) -> FoundLaw | None:
     starts = [fit, null] if fit.effects else [null]
     trials: list[tuple[LawTrial, LawSearch]] = []
     for start in starts:
@@ -327,7 +323,7 @@ def _law_of_the_mean(
     chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / (3.0 * ws.psds), 2.0))
     p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
     bic = gain - (best.cost - fit_with_law.chi2 - penalty * without.parameters)
-    held = heldout_gain(ws, without, fit_with_law, rng)
+    held = heldout_gain(ws, without, fit_with_law)
     residual_gap = heldout_gap(ws, fit_with_law)
     # As of effects: no other case can speak for or against what one case alone shows.
     predicts = _predicts(ws, fit, heldout_gap(ws, fit_with_law, home=False))
@@ -365,7 +361,7 @@ def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
     changes = np.flatnonzero(np.any(np.diff(o.loads, axis=0) != 0.0, axis=1)) * o.period
     if len(times) < SEVERAL or more or len(changes) == 0 or len(changes) > o.duration:
         return False
-    at_change = np.abs(times[:, None] - changes).min(axis=1) < NEAR_S
+    at_change = np.abs(times[:, None] - changes).min(axis=1) < APART_S
     return bool(np.mean(at_change) > 0.5)
 
 

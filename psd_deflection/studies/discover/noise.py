@@ -19,20 +19,8 @@ from scipy.signal import detrend
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.discover.thresholds import (
-    APART,
-    CERTAIN_SD,
-    CLIP_SD,
-    COLOURED_SD,
-    CORNER_GAIN,
-    CORNERS,
-    HIGHEST_HZ,
-    LEAST_REST,
-    LEAST_VALUES,
-    ORDER,
-    WIDER,
-)
-from psd_deflection.studies.loads.thresholds import MANYFOLD, PART, SAME
+from psd_deflection.studies.discover.thresholds import BANDS, CERTAIN_SD, CORNERS, LEAST_REST, ORDER, SIGNIFICANT
+from psd_deflection.studies.loads.thresholds import AS_GOOD, DISTINCT_SD, MANYFOLD, PART, SAME
 
 
 def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
@@ -46,23 +34,24 @@ def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatAr
     light = gains[2::3]
     corners = np.where(gains.max(axis=1) > 0.0, CORNERS[np.argmax(gains, axis=1)], 0.0)
     dots = np.sort(corners[list(dot_channels(channels // 3))])
-    # What moves some of the dots (three of four), or one light, alone is more than this noise.
-    if light.sum(axis=0).max() < CORNER_GAIN or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
+    # What moves some of the dots (three of four), or one light, alone is more than this noise. One more parameter gains
+    # 1 in chi-square by chance; the corner goes with the square of an amplitude.
+    if 2.0 * light.sum(axis=0).max() < 1.0 or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
         return np.zeros(channels)
     low, high = corners[2::3].min(), corners[2::3].max()
-    return np.asarray(np.minimum(corners, WIDER * min(high, APART * low, dots[1])))
+    return np.asarray(np.minimum(corners, SIGNIFICANT * min(high, AS_GOOD**2 * low, dots[1])))
 
 
 def _gains(rows: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
     """Return the log-likelihood that each of ``CORNERS`` gains over white noise, of one channel (P. Whittle, 1953)."""
     gains = np.zeros(len(CORNERS))
     for row, period in zip(rows, periods, strict=True):
-        values = np.clip(row, -CLIP_SD, CLIP_SD)
+        values = np.clip(row, -CERTAIN_SD, CERTAIN_SD)
         count = int(np.count_nonzero(values))
-        if count < LEAST_VALUES:
+        if count < LEAST_REST:
             continue
         f = np.fft.rfftfreq(len(row), period)
-        low = (f > 0.0) & (f <= HIGHEST_HZ)
+        low = (f > 0.0) & (f <= BANDS[4])
         power = np.abs(np.fft.rfft(values)[low]) ** 2 / count
         density = 1.0 + CORNERS[:, None] / f[low]
         gains += (power * (1.0 - 1.0 / density) - np.log(density)).sum(axis=1)
@@ -293,7 +282,7 @@ def _memories(residual: FloatArray, rest: list[slice], floors: FloatArray) -> li
                 significant[c] = abs(pooled[c, 1]) / pooled[c, 0] * np.sqrt(count)
     most = 2 * int(np.sum(significant > CERTAIN_SD)) > len(significant)
     return [
-        row if s > (COLOURED_SD if most else CERTAIN_SD) else None for row, s in zip(pooled, significant, strict=True)
+        row if s > (DISTINCT_SD if most else CERTAIN_SD) else None for row, s in zip(pooled, significant, strict=True)
     ]
 
 

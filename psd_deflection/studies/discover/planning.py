@@ -28,7 +28,8 @@ from psd_deflection.studies.discover.experiment import (
 from psd_deflection.studies.discover.search.comparison import EQUIVALENT
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.thresholds import EFFORT_OF_A_MINUTE, SURE, WORTH_OF_PIECE
+from psd_deflection.studies.discover.thresholds import SURE
+from psd_deflection.studies.loads.thresholds import SAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,12 +267,12 @@ def best_combination(
             more = total + s
             if more.seconds <= seconds + 1e-6:
                 worth = float(np.mean(np.minimum(separations(more) / SURE, 1.0)))
-                trials.append((worth - EFFORT_OF_A_MINUTE * more.seconds / 60.0, len(trials), piece, more))
+                trials.append((worth - SAME * more.seconds / 60.0, len(trials), piece, more))
         if not trials:
             return value, chosen
         best, _, piece, more = max(trials, key=lambda t: t[:2])
         # One piece is there in any case: to say what it would be like.
-        if chosen and best < value + WORTH_OF_PIECE:
+        if chosen and best < value + SAME:
             return value, chosen
         value, total = best, more
         chosen.append(piece)

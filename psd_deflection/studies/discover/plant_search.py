@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.search.screen import Screen, candidates, si
 from psd_deflection.studies.discover.search.smooth import Smooth, Table, smooth_of
 from psd_deflection.studies.discover.search.weighing import sd_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, search, solve, weigh, where
-from psd_deflection.studies.discover.thresholds import LEAST_LEVEL, P_CHANCE, PLANT_BUDGET, SIGNIFICANT, TINY
+from psd_deflection.studies.discover.thresholds import LEAST_LEVEL, P_CHANCE, PLANT_BUDGET, SIGNIFICANT
 from psd_deflection.studies.loads.thresholds import PART, SAME
 from psd_deflection.studies.study import PageSection
 
@@ -146,7 +146,8 @@ class PlantComparison(Comparison):
         # What is left of an exact simulation is rounding: no level is below that.
         tables = np.concatenate([np.nan_to_num(m) for m in self.measured], axis=1)
         size = np.abs(tables).max(axis=1, initial=0.0)
-        level = np.maximum(np.maximum(level, self.known), np.maximum(LEAST_LEVEL * size, TINY))
+        tiny = math.sqrt(np.finfo(np.float64).tiny)
+        level = np.maximum(np.maximum(level, self.known), np.maximum(LEAST_LEVEL * size, tiny))
         independent = np.array([self._independent(difference, c) for c in range(len(self.channels))])
         return level, independent
 

@@ -28,7 +28,7 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.conclusion import model_yaml
 from psd_deflection.studies.discover.noise import settling
 from psd_deflection.studies.discover.search.fit import BoolArray
-from psd_deflection.studies.discover.thresholds import CERTAIN_SD, FOLDS, HALF, TABLE_FOLDS
+from psd_deflection.studies.discover.thresholds import CERTAIN_SD, FEWEST_CASES, FOLDS, HALF
 from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.loads.thresholds import FEWEST_LOADS, SEVERAL
 from psd_deflection.studies.study import Notify, warn_caller
@@ -273,7 +273,7 @@ class ReadingsPlant(Plant):
         out = []
         for t in self.tables:
             _, index = np.unique(t.loads, axis=0, return_inverse=True)
-            out.append(np.asarray(index.ravel() % min(TABLE_FOLDS, len(t.distinct)), dtype=np.int64))
+            out.append(np.asarray(index.ravel() % min(FEWEST_CASES, len(t.distinct)), dtype=np.int64))
         return out
 
     def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:

@@ -30,7 +30,7 @@ from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, likely_delays
-from psd_deflection.studies.discover.thresholds import EFFECT_ON_LOAD, MOST_MEASURED
+from psd_deflection.studies.discover.thresholds import HALF, LEVELS
 from psd_deflection.studies.loads.alignment import SKEW, LatePsd, aligned
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads
 from psd_deflection.studies.loads.effective import (
@@ -267,7 +267,7 @@ def _wrong_notes(
     """What of recording ``i`` was noted otherwise than it hung; ``difference`` (3P, m), V: measured minus simulated."""
     o = workspace.observations[i]
     implied = levels(workspace, i, difference, times(o, i))
-    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), EFFECT_ON_LOAD)
+    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), HALF)
     if not wrong and (unannotated := unannotated_times(implied, len(o.loads), o.period)):
         return [*unannotated]
     return [*swayed(workspace, i, difference, implied), *wrong]
@@ -314,7 +314,7 @@ def with_free(recorded: Recorded, workspace: Workspace) -> Workspace:
             free += in_time(o, i, note)
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(corrected.loads).max(axis=0), 1e-30)
-        if len(corrected.measured) <= MOST_MEASURED:
+        if len(corrected.measured) <= LEVELS:
             free += [d for m in corrected.measured for d in of_hold(o, i, m, m.sd * unit)]
     workspace = workspace.with_free(free)
     # What a large load bends is no change in proportion.

@@ -23,9 +23,9 @@ from psd_deflection.studies.check.wirings import differences, line, wirings_of
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, zero_moved
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.thresholds import AS_GOOD, LARGEST_DELAY_S, LEAST_S, SMALL_MOVE
+from psd_deflection.studies.discover.thresholds import SMALL_MOVE
 from psd_deflection.studies.loads.plate_motion import dots_of
-from psd_deflection.studies.loads.thresholds import EXACT, MANYFOLD
+from psd_deflection.studies.loads.thresholds import AS_GOOD, EXACT, FINE_SECONDS, MANYFOLD, ONE_DELAY_S
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +221,7 @@ def likely_delays(workspace: Workspace) -> list[float]:
     simulated = workspace.simulate(workspace.base)
     total: FloatArray | None = None
     step = workspace.observations[0].period * workspace.fine[0]
-    reach = round(LARGEST_DELAY_S / step)
+    reach = round(ONE_DELAY_S / step)
     for s, m, c, noise in zip(simulated, workspace.measured, workspace.count, workspace.noise, strict=True):
         for k in workspace.rows:
             there = c[k] > 0.0
@@ -241,7 +241,7 @@ def likely_delays(workspace: Workspace) -> list[float]:
         # Between two fine blocks: where a parabola has its top.
         a, b, c = total[peak - 1 : peak + 2].tolist()
         early = 0.5 * (a - c) / (a - 2.0 * b + c) * step
-        return [-early] if abs(early) >= LEAST_S else []
+        return [-early] if abs(early) >= 0.125 * FINE_SECONDS else []
     # The readings follow later than simulated: the loads are noted early.
     return sorted({-best * step, -(best + 1) * step, -(best - 1) * step} - {0.0})
 

@@ -114,7 +114,7 @@ def accepted(problem: Problem) -> Problem:
         heldout, fails = [], []
         ws, search_used, fit = problem.comparison, problem.search, problem.fit
         for i, without in enumerate(search_used.without_each(fit, problem.result.null)):
-            gain = heldout_gain(ws, without, fit, problem.rng)
+            gain = heldout_gain(ws, without, fit)
             heldout.append(gain)
             columns = fit.columns_of(i)
             chi2 = without.chi2 - fit.chi2

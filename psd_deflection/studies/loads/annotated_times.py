@@ -19,22 +19,24 @@ from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.steps import applied, link_modes, link_motion, time_of_step
 from psd_deflection.studies.loads.thresholds import (
-    ALIKE_S,
     APART_S,
-    BETTER,
+    AS_GOOD,
     BRIEF_S,
     DISTINCT_SD,
-    FARTHEST_S,
+    EXACT,
     FEWEST_VALUES,
+    FINE_SECONDS,
     LATE_COST,
     ON_TIME_S,
     ONE_DELAY_S,
     OUTLIER_SD,
+    PART,
     SAME,
-    SETTLED,
     SKIP_STEP,
-    WHITE,
 )
+
+ALIKE_S = 0.5 * FINE_SECONDS
+"""Notes are late alike if their delays differ by less than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +73,7 @@ def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoa
             continue
         centred = part - part.mean(axis=0)
         memory = np.abs((centred[1:] * centred[:-1]).sum(axis=0)) / np.maximum((centred**2).sum(axis=0), 1e-300)
-        if np.any(memory[noise > 0.0] > max(WHITE, 4.0 / math.sqrt(b - a))):
+        if np.any(memory[noise > 0.0] > max(PART, 4.0 / math.sqrt(b - a))):
             continue
         lengths = np.diff(np.append(at[a:b], last))
         out[at[a] : last] = (part * lengths[:, None]).sum(axis=0) / lengths.sum()
@@ -238,7 +240,7 @@ def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> Corrected
         return None
     corrected, timed = loads_with_times(loads, changes, fitted, period)
     residual, rest = residual_of_dots(rig, dots, corrected)
-    if BETTER * residual > residual_of_dots(rig, dots, loads)[0]:
+    if AS_GOOD * residual > residual_of_dots(rig, dots, loads)[0]:
         return None
     return replace(without_rough_motion(rig, corrected, [n for n in timed if n.wrong], rest), timed=tuple(timed))
 
@@ -342,7 +344,7 @@ def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], pe
         for b, step in enumerate(steps, start=1):
             away = float(apart[a - 1, b - 1])
             unlike = math.log(max(step.size, 1e-12) / (factor * float(sizes[i]))) / 0.5
-            pair = math.inf if away > FARTHEST_S else LATE_COST * away + min(unlike**2, 8.0)
+            pair = LATE_COST * away + min(unlike**2, 8.0)
             pair -= least_share * float(on_time[a - 1, b - 1])
             ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + DISTINCT_SD**2, cost[a, b - 1] + SKIP_STEP)
             way[a, b] = int(np.argmin(ways))
@@ -378,7 +380,7 @@ def residual_of_dots(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[flo
 def in_motion(rig: Rig, note: CorrectedNote, t: FloatArray) -> BoolArray:
     """Samples (n,) in which the link moves by the load of ``note``."""
     slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in link_modes(rig))
-    ends = note.applied + note.took + SETTLED * slowest
+    ends = note.applied + note.took - math.log(EXACT) * slowest
     return np.asarray((t >= note.applied - 0.02) & (t < ends))
 
 

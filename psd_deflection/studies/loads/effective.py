@@ -27,14 +27,13 @@ from psd_deflection.studies.loads.thresholds import (
     FEWEST_LOADS,
     MANYFOLD,
     OUTLIER_SD,
+    PART,
     PLATE_M,
-    RINGS_S,
-    SETTLED,
+    REST_S,
     SEVERAL,
     SLIGHT,
     SWAY_HZ,
     TOLERANCE,
-    TONE,
 )
 
 
@@ -91,7 +90,7 @@ def swaying(
     size, fine = implied.size, period * implied.size
     rows = []
     for p in implied.holds:
-        a, b = p.first // size + round(RINGS_S / fine), p.last // size
+        a, b = p.first // size + round(REST_S / fine), p.last // size
         part = implied.rest[:2, a:b]
         there = np.isfinite(part).all(axis=0)
         # How the link moved before the first sample is nobody's mistake.
@@ -108,7 +107,7 @@ def swaying(
         axis = int(np.argmax(each))
         peak = peak_frequency(f[band], power[axis, band])
         # A step that nobody noted has no tone.
-        tone = float(power[axis, band & (np.abs(f - peak) <= TONE * peak)].sum())
+        tone = float(power[axis, band & (np.abs(f - peak) <= PART * peak)].sum())
         if peak * (b - a) * fine < 2.0 or tone < 0.5 * float(power[axis, band].sum()):
             each = np.zeros(2)
         rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / implied.compliance[axis]), peak))
@@ -128,7 +127,7 @@ def swaying(
 def _swung(implied: ImpliedLoads, p: Hold, frequency: float, period: float) -> FloatArray:
     """(k, 3): the load in each sample of ``p`` that the link swings with: a tone whose amplitude changes slowly."""
     size, count = implied.size, p.last - p.first
-    a, b = p.first // size + round(RINGS_S / (period * size)), p.last // size
+    a, b = p.first // size + round(REST_S / (period * size)), p.last // size
 
     def tone(at: FloatArray) -> FloatArray:
         along, phase = at / count, 2.0 * math.pi * frequency * period * at
@@ -176,7 +175,7 @@ def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> Floa
     d = rig.dynamics
     slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))
     for s in swayed:
-        out[s.hold.first : s.hold.last + round(SETTLED * slowest / s.period)] = np.nan
+        out[s.hold.first : s.hold.last + round(-math.log(EXACT) * slowest / s.period)] = np.nan
     return out
 
 

@@ -17,20 +17,17 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.annotated_times import ordinal, unannotated_steps
 from psd_deflection.studies.loads.plate_motion import across_plate, dot_rows, fine_means, moved_plate
 from psd_deflection.studies.loads.thresholds import (
-    CLOSE,
-    DISTANT,
     DISTINCT_SD,
     EXACT,
     FEWEST_LOADS,
     FINE_SECONDS,
     LONG_S,
+    MANYFOLD,
     MINOR,
-    OFFSET,
     PART,
     PLATE_M,
     ROUND_STEPS,
     SLIGHT,
-    SOFTER,
     TOLERANCE,
 )
 
@@ -202,13 +199,13 @@ def outliers(implied: ImpliedLoads, bent: float = 0.0, largest: float = ANY) -> 
     sign or another unit may change a load that no other is like.
     """
     count = len(implied.holds)
-    if np.abs(implied.more).max(initial=0.0) < CLOSE * DISTINCT_SD * TOLERANCE or not closes(implied, PART + bent):
+    if np.abs(implied.more).max(initial=0.0) < PART * DISTINCT_SD * TOLERANCE or not closes(implied, PART + bent):
         return StandingOut()
     # A detector at fault moves its dots as no plate does.
     as_plate = np.abs(implied.across) <= SLIGHT * implied.sizes + PLATE_M
     off = deviation_in_tolerances(implied, (), 0.0)
     order = np.argsort(-off, kind='stable')
-    for share, right, most in ((CLOSE, FEWEST_LOADS + 1, count - FEWEST_LOADS - 1), (1.0, FEWEST_LOADS + 2, 2)):
+    for share, right, most in ((PART, FEWEST_LOADS + 1, count - FEWEST_LOADS - 1), (1.0, FEWEST_LOADS + 2, 2)):
         for wrong in range(1, min(most, count - right) + 1):
             gone = order[:wrong]
             stands = are_outliers(off[gone] / share, off[order[wrong:]] / share, bent)
@@ -217,16 +214,16 @@ def outliers(implied: ImpliedLoads, bent: float = 0.0, largest: float = ANY) -> 
     # Two wrong ones of seven leave too few to tell what effects do.
     fitting, tried = 0, []
     for k in range(1, count if count > FEWEST_LOADS + 2 else 0):
-        slopes, offset = proportional_part(implied, (k,), SOFTER)
-        if np.abs(slopes).max() > DISTINCT_SD * SOFTER or np.abs(offset).max() > DISTINCT_SD * OFFSET:
+        slopes, offset = proportional_part(implied, (k,), MINOR)
+        if np.abs(slopes).max() > DISTINCT_SD * MINOR or np.abs(offset).max() > DISTINCT_SD * TOLERANCE:
             continue
-        apart = deviation_in_tolerances(implied, (k,), SOFTER)
+        apart = deviation_in_tolerances(implied, (k,), MINOR)
         remaining = np.delete(apart, k)
         fitting += bool(remaining.max() <= 1.0 + bent * apart[k])
         if are_outliers(apart[k : k + 1], remaining, bent) and is_known(implied, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
-    return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
+    return StandingOut(tuple(tried), MINOR) if len(tried) == fitting == 1 else StandingOut()
 
 
 def is_known(implied: ImpliedLoads, gone: IntArray, largest: float) -> bool:
@@ -257,7 +254,7 @@ def _annotated_twice(implied: ImpliedLoads, k: int) -> FloatArray | None:
         return None
     applied = 0.5 * (before + annotated)
     off = np.abs(implied.more[k] - (applied - annotated))
-    allowed = TOLERANCE + EXACT * np.abs(annotated).max() + SOFTER * np.abs(applied)
+    allowed = TOLERANCE + EXACT * np.abs(annotated).max() + MINOR * np.abs(applied)
     return applied if np.all(off <= allowed) and np.any(np.abs(applied - annotated) > DISTINCT_SD * allowed) else None
 
 
@@ -273,7 +270,7 @@ def proportional_part(implied: ImpliedLoads, gone: Sequence[int], softer: float)
         return np.zeros((3, 3)), np.zeros(3)
     keep = np.setdiff1d(np.arange(len(implied.holds)), gone)
     x = np.column_stack((implied.annotated[keep], np.ones(len(keep))))
-    prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
+    prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [0.1**2])
     both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ implied.more[keep]), dtype=np.float64)
     return both[:3], both[3]
 
@@ -293,7 +290,7 @@ def all_free(implied: ImpliedLoads, loads: FloatArray) -> bool:
     """
     if len(implied.holds) < FEWEST_LOADS or not closes(implied):
         return False
-    return int(np.count_nonzero(deviation_in_tolerances(implied, (), SOFTER) > 1.0)) >= 2 or are_rounded(implied, loads)
+    return int(np.count_nonzero(deviation_in_tolerances(implied, (), MINOR) > 1.0)) >= 2 or are_rounded(implied, loads)
 
 
 def may_be_rounded(implied: ImpliedLoads) -> bool:
@@ -420,13 +417,14 @@ def wrong_notes_against(
     ``largest``: share by which effects may change a load; signs and units are right then.
     """
     first = asked(loads)
-    if not len(first.holds) or np.abs(first.more).max(initial=0.0) < CLOSE * DISTINCT_SD * TOLERANCE:
+    if not len(first.holds) or np.abs(first.more).max(initial=0.0) < PART * DISTINCT_SD * TOLERANCE:
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
     annotated = first.annotated
     readings_ask = asked(np.zeros_like(loads)).more
-    distant = np.abs(readings_ask - annotated).max(axis=1) > DISTANT + MINOR * np.abs(readings_ask).max(axis=1)
+    linear = MANYFOLD * TOLERANCE + MINOR * np.abs(readings_ask).max(axis=1)
+    distant = np.abs(readings_ask - annotated).max(axis=1) > linear
     applied = np.where(distant[:, None], readings_ask, annotated)
 
     def against() -> ImpliedLoads:

@@ -16,7 +16,8 @@ from psd_deflection.base.charts import TimeAxis
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.studies.discover.thresholds import BANDS, BUDGET, P_CHANCE, P_LIBRARY, P_STRONG, SIMULATION_ERROR
+from psd_deflection.studies.discover.thresholds import BANDS, BUDGET, P_CHANCE, P_LIBRARY, P_STRONG
+from psd_deflection.studies.loads.thresholds import SIMULATION_ERROR
 
 EQUIVALENT = round(4.0 * float(ndtri(1.0 - P_CHANCE)) ** 2, 1)
 """Loss in chi-square below which an alternative of no more parameters counts as equivalent: at

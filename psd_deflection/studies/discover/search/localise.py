@@ -14,8 +14,9 @@ from psd_deflection.records import FloatArray, IntArray, channel_names
 from psd_deflection.studies.discover.hidden import only_in
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.thresholds import BANDS, CLIP_SD, DRAWS, P_CHANCE, SIMULATION_ERROR
+from psd_deflection.studies.discover.thresholds import BANDS, CERTAIN_SD, DRAWS, P_CHANCE
 from psd_deflection.studies.loads.plate_motion import fine_means
+from psd_deflection.studies.loads.thresholds import SIMULATION_ERROR
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +226,7 @@ def localise(
     """
     layouts = _layouts(workspace)
     apart = None if explained is None else workspace.split(explained)
-    z, _ = _energies(workspace.split(np.clip(residual, -CLIP_SD, CLIP_SD)), layouts, apart)
+    z, _ = _energies(workspace.split(np.clip(residual, -CERTAIN_SD, CERTAIN_SD)), layouts, apart)
     raw_z, raw_excess = _energies(workspace.split(residual), layouts, apart)
     maxima = np.empty(DRAWS)
     q = None

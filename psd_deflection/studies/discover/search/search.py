@@ -27,20 +27,7 @@ from psd_deflection.studies.discover.search.trials import (
     wald_chi_square,
     words_of_terms,
 )
-from psd_deflection.studies.discover.thresholds import (
-    BIC_GAIN,
-    FARTHEST_ERROR,
-    HALF,
-    HALVED,
-    LIKELY,
-    OTHER_FREQUENCIES,
-    OTHER_RATES,
-    PAIRS,
-    RINGING_SHARE,
-    ROUNDS,
-    SURE,
-    SWAP,
-)
+from psd_deflection.studies.discover.thresholds import BIC_GAIN, HALF, LIKELY, OTHER_ERRORS, PAIRS, ROUNDS, SURE
 from psd_deflection.studies.loads.thresholds import EXACT, MINOR, PART
 
 LATE = 'load_delay'
@@ -99,14 +86,15 @@ def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[A
         if s.candidate.effect.name not in trials.workspace.first:
             continue
         start, name = s.candidate.from_coefficients(s.coefficients), s.candidate.effect.name
-        if name == 'sensitivity' and start.values['error'] < FARTHEST_ERROR:
-            start = ActiveEffect(start.effect, {'error': HALVED})
+        if name == 'sensitivity':
+            # A linear step goes too far when readings are twice as large.
+            start = ActiveEffect(start.effect, {'error': max(start.values['error'], -HALF)})
         if s.gain > LIKELY * best:
             starts.append([start])
         if name == 'sample_rate' and is_far_off(null):
             # A linear step does not reach another frequency of the ringing.
-            starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
-    return starts + _frequency_starts(trials, null, [s for s in scores if s.gain > RINGING_SHARE * best])
+            starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_ERRORS]
+    return starts + _frequency_starts(trials, null, [s for s in scores if s.gain > EXACT * best])
 
 
 def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
@@ -121,7 +109,7 @@ def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> lis
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
     """Return the best start for another natural frequency: from far away a linear step does not reach it."""
     start = score.candidate.from_coefficients(score.coefficients)
-    starts = OTHER_FREQUENCIES if is_far_off(beside) else ()
+    starts = OTHER_ERRORS if is_far_off(beside) else ()
     return min(
         [start, *(ActiveEffect(start.effect, {'error': v}) for v in starts)],
         key=lambda a: ws.loss(ws.residual([*ws.base, *beside.coefficients_with_nuisance, a])[0]),
@@ -427,14 +415,14 @@ class Search(Trials):
         if any(a.effect.name not in self.workspace.setup for a in rest):
             taken |= self.workspace.first
         # Screening is linear: a candidate that falls short by little needs a full refit.
-        bar = min(SWAP * gain, gain - SURE) if gain > 100.0 else 0.5 * gain
+        bar = min(HALF * gain, gain - SURE) if gain > 100.0 else 0.5 * gain
         if self.workspace.open_level:
             # A rough machine is far from linear.
             bar = 0.0
         best: dict[str, Score] = {}
         for s in self.screen.score(without.residual, unbound(without)):
             name = s.candidate.effect.name
-            least = RINGING_SHARE * gain if name in RINGING and is_far_off(without) else bar
+            least = EXACT * gain if name in RINGING and is_far_off(without) else bar
             if name not in taken and s.gain >= least:
                 best.setdefault(name, s)
         return sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.budget_of(current) else 2]

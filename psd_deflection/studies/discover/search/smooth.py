@@ -25,13 +25,10 @@ from psd_deflection.studies.discover.thresholds import (
     BIC_GAIN,
     FEWEST_CASES,
     HALF,
-    LENGTHS,
     LEVELS,
     MOST_VALUES,
-    NOISES,
     P_STRONG,
-    SIZES,
-    START,
+    RANGE,
 )
 from psd_deflection.studies.loads.thresholds import FEWEST_VALUES
 
@@ -128,8 +125,8 @@ def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
 def _shaped(remains: Remainders, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Logarithms (channels, 1 + 2 len(names)) of noise, then size and length of each, and the likelihood of all."""
     channels = np.unique(remains.channel)
-    usual = np.log([START[2], *(START[0], START[1]) * len(names)])
-    low, high = np.log([NOISES, *(SIZES, LENGTHS) * len(names)]).T
+    usual = np.full(1 + 2 * len(names), 0.5 * np.log(RANGE[0] * RANGE[1]))
+    low, high = np.tile(np.log(RANGE), (len(usual), 1)).T
     begin = np.tile(usual, (len(channels), 1)) if start is None else start
     bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
     basis = orthonormal_basis(remains.sizes)

@@ -21,12 +21,11 @@ from psd_deflection.studies.discover.search.screen import Score, Screen, promisi
 from psd_deflection.studies.discover.thresholds import (
     BIC_GAIN,
     FEWEST_CASES,
+    LEVELS,
     LIKELY,
     MANY_EFFECTS,
-    MOST_TERMS,
     ROUNDS,
     TRIALS,
-    VALLEYS,
 )
 from psd_deflection.studies.loads.thresholds import MANYFOLD, MINOR, PART
 
@@ -52,7 +51,7 @@ class Terms:
 
 
 def further_terms(
-    screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str], most: int = MOST_TERMS
+    screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str], most: int = LEVELS
 ) -> Terms | None:
     """Return the terms of ``screen`` that pass one by one beside ``fit``, to first order; None if no term passes.
 
@@ -83,7 +82,7 @@ def words_of_terms(workspace: Comparison, fit: Fit, terms: Terms) -> str:
     now = workspace.gap(fit.difference)
     listed = ', '.join(name if n == 1 else f'{n} × {name}' for name, n in Counter(terms.names).items())
     count = len(terms.names)
-    many = f'{MOST_TERMS} or more' if count == MOST_TERMS else f'{count} more'
+    many = f'{LEVELS} or more' if count == LEVELS else f'{count} more'
     return (
         f'{many} term{"" if count == 1 else "s"} ({listed}) would pass one by one, to first order; '
         'on unseen load cases the gap would be '
@@ -159,7 +158,7 @@ def _shapes(workspace: Comparison, active: ActiveEffect) -> list[dict[str, float
     for p in shapes:
         low, high = p.bounds(workspace.physics, active.values)
         between = np.geomspace if low > 0.0 else np.linspace
-        each = round(VALLEYS ** (1.0 / len(shapes)))
+        each = round(LEVELS ** (1.0 / len(shapes)))
         grids.append([(p.name, float(v)) for v in between(low, high, each + 2)[1:-1]])
     return [dict(shape) for shape in itertools.product(*grids)] if grids else []
 

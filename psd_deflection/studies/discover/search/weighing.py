@@ -30,10 +30,9 @@ from psd_deflection.studies.discover.thresholds import (
     P_LIBRARY,
     P_STRONG,
     SIGNIFICANT,
-    STAND_IN_ERROR,
     SURE,
 )
-from psd_deflection.studies.loads.thresholds import DISTINCT_SD, SAME
+from psd_deflection.studies.loads.thresholds import DISTINCT_SD, SAME, SIMULATION_ERROR
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +88,7 @@ def _odds(group: Sequence[tuple[int, float, str]], covariance: FloatArray) -> fl
     of_logs = covariance[np.ix_(columns, columns)] / np.outer(sizes, sizes)
     # The logarithm of the first less those of the others.
     less = np.column_stack((np.ones(len(group) - 1), -np.eye(len(group) - 1)))
-    size_covariance = less @ (of_logs + 0.5 * STAND_IN_ERROR**2 * np.eye(len(group))) @ less.T
+    size_covariance = less @ (of_logs + 0.5 * SIMULATION_ERROR**2 * np.eye(len(group))) @ less.T
     off = less @ np.log(np.abs(sizes))
     density = math.exp(-0.5 * float(off @ np.linalg.solve(size_covariance, off))) / math.sqrt(
         np.linalg.det(2.0 * np.pi * size_covariance)
@@ -350,7 +349,7 @@ def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
     share.
     """
     for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
-        apart = DISTINCT_SD * math.hypot(first.sd, second.sd, STAND_IN_ERROR * first.value)
+        apart = DISTINCT_SD * math.hypot(first.sd, second.sd, SIMULATION_ERROR * first.value)
         clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CERTAIN_SD
         same = first.moves == second.moves and abs(first.value - second.value) <= apart
         if first.effect != second.effect and same and clear:

@@ -19,9 +19,9 @@ from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
 from psd_deflection.studies.discover.hidden import FIRST, SETUP, Direction, Free, LoadDirection, added, moved, only_in
 from psd_deflection.studies.discover.noise import NoiseModel, corners_of, estimate_noise
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
-from psd_deflection.studies.discover.thresholds import FOLDS, MAX_FINE, PIECE_SECONDS
+from psd_deflection.studies.discover.thresholds import FOLDS, MAX_FINE
 from psd_deflection.studies.loads.plate_motion import dot_rows, fine_means
-from psd_deflection.studies.loads.thresholds import FINE_SECONDS, MINOR, SLIGHT
+from psd_deflection.studies.loads.thresholds import FINE_SECONDS, MINOR, REST_S, SLIGHT
 
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 
@@ -295,10 +295,10 @@ class Workspace(Comparison):
         return float(np.sqrt(total / max(count, 1)))
 
     def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Log-likelihood that residual ``b`` gains over ``a`` (D,), in pieces of ``PIECE_SECONDS``."""
+        """Log-likelihood that residual ``b`` gains over ``a`` (D,), in pieces of ``REST_S``."""
         out: list[FloatArray] = []
         for part, o, size in zip(self.split(0.5 * (a * a - b * b)), self.observations, self.fine, strict=True):
-            length = max(1, round(PIECE_SECONDS / (o.period * size)))
+            length = max(1, round(REST_S / (o.period * size)))
             total = part.sum(axis=0)
             out.append(np.add.reduceat(total, np.arange(0, len(total), length)))
         return np.concatenate(out)
