@@ -3,7 +3,6 @@
 """``make bench``: the error of the estimates against the simulated truth, beside the lower bound for any method."""
 
 import argparse
-import sys
 
 import numpy as np
 
@@ -46,14 +45,13 @@ def errors(rig: Rig, load: tuple[float, float, float], blocks: int) -> tuple[Flo
     return estimates - truth[: len(estimates)], truth.mean(axis=0)
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--blocks', type=int, default=5000, help='blocks of each load case')
     blocks = parser.parse_args().blocks
     rig = load_rig()
     print(f'rms error against the simulated truth, {blocks} blocks a load case; in brackets over the Cramér–Rao bound')
-    unit = np.array([1e6, 1e6, np.degrees(1e3)])
-    worst = 0.0
+    unit, worst = np.array([1e6, 1e6, np.degrees(1e3)]), 0.0
     for name, load in CASES.items():
         error, pose = errors(rig, load, blocks)
         rms = np.sqrt((error**2).mean(axis=0))
@@ -62,8 +60,7 @@ def main() -> int:
         cells = zip(('dX', 'dY', 'theta'), rms * unit, ratio, ('um', 'um', 'mdeg'), strict=True)
         print(f'  {name:20}' + ''.join(f'  {n} {v:.3f} {u} ({r:.2f})' for n, v, r, u in cells))
     print(f'  largest ratio {worst:.2f} (bound 1.1)')
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

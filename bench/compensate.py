@@ -4,7 +4,6 @@
 
 import argparse
 import collections
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,8 +23,7 @@ from psd_deflection.records import FloatArray
 
 ROOT = Path(__file__).resolve().parent.parent
 URDF = ROOT / 'config' / 'two_links.urdf'
-PERIOD = 0.02
-LATE = 0.03
+PERIOD, LATE = 0.02, 0.03
 NOISE = 1e-6  # Of a deflection, m, one standard deviation.
 PAYLOAD = np.array([0.0, 0.0, -20.0])
 TAKEN, MOVED, ARRIVED, LOST, BACK, ENABLED, PUT_DOWN, END = 1.0, 8.0, 11.0, 16.0, 16.5, 3.0, 20.0, 26.0
@@ -108,7 +106,7 @@ def chart(without: Ran, ran: Ran) -> Chart:
     return Chart('distance from the rigid pose and offsets of the joints over time', panels)
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--out', type=Path, default=ROOT / 'build' / 'compensate')
     args = parser.parse_args(argv)
@@ -137,8 +135,7 @@ def main(argv: list[str] | None = None) -> int:
     (args.out / 'report.html').write_text(page('Compensation', body), encoding='utf-8')
     figure_of(compensated).savefig(args.out / 'compensation.png', dpi=90)
     print(f'the page: {args.out / "report.html"}')
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

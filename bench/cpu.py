@@ -27,8 +27,7 @@ SETTLE_BLOCKS = 250  # Five seconds of blocks: what is imported and made at the 
 PATIENCE_S = 300.0  # Longest time until the node runs, s.
 ENOUGH = 0.98  # Least share of the blocks that a node gets through which is not held up by others.
 PARTS: dict[str, list[str]] = tomllib.loads((ROOT / 'bench' / 'cpu_parts.toml').read_text(encoding='utf-8'))
-COLLECTION = 'garbage collection'
-REST = 'rest: waking up, waiting, loops'
+COLLECTION, REST = 'garbage collection', 'rest: waking up, waiting, loops'
 
 
 def resolve(place: str) -> tuple[Any, str, Callable[..., Any]]:

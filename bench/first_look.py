@@ -4,7 +4,6 @@
 
 import argparse
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -15,8 +14,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from tools.browser import open_browser
 from tools.program import ROOT, Program
 
-LIMIT_S = 60.0
-MOVED = 1e-4
+LIMIT_S, MOVED = 60.0, 1e-4
 LOADED = """const all = [...performance.getEntriesByType('navigation'), ...performance.getEntriesByType('resource')];
 const [drawn] = performance.getEntriesByName('drawn');
 return [all.reduce((sum, e) => sum + e.transferSize, 0), Math.max(...all.map((e) => e.responseEnd)), drawn.startTime]"""
@@ -56,7 +54,7 @@ def look(browser: webdriver.Chrome, folder: str) -> tuple[float, float, float, s
         program.end()
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--times', type=int, default=1)
     args = parser.parse_args()
@@ -73,8 +71,7 @@ def main() -> int:
                 print(load)
         finally:
             browser.quit()
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

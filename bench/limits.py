@@ -219,8 +219,7 @@ def conversion(times: int, minutes: float) -> list[Row]:
 
 def simulation(times: int) -> list[Row]:
     """60 s of the rig with ten effects; the peer has the three modes alone, without optics, effects and electronics."""
-    rig = with_effects_of(load_rig(), TEN, 'bench')
-    loads = np.zeros((60_000, 3))
+    rig, loads = with_effects_of(load_rig(), TEN, 'bench'), np.zeros((60_000, 3))
     loads[5_000:30_000] = (5.0, -10.0, 2.0)
     model = ForwardModel(rig)
     physics = model.physics

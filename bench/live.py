@@ -57,8 +57,7 @@ def subscriber() -> None:
 
     listen('/link_tip/deflection')
     listen('/bare')
-    stop = until_stdin_closes()
-    ready = False
+    stop, ready = until_stdin_closes(), False
     while not stop.is_set():
         rclpy.spin_once(node, timeout_sec=0.1)
         # Publisher and subscriber must discover each other before anything can be measured.
@@ -144,8 +143,7 @@ def bare_publishers(recording: str, seconds: float) -> None:
     from psd_deflection.ros.endpoints import message_class
 
     rclpy.init()
-    node = rclpy.create_node('bench_publishers')
-    blocks = blocks_of(recording)
+    node, blocks = rclpy.create_node('bench_publishers'), blocks_of(recording)
     publishers = {topic: node.create_publisher(message_class(kind), topic, 10) for topic, kind, _ in next(blocks)}
 
     def step() -> None:
@@ -294,8 +292,7 @@ def measure(seconds: float, settle: float, page: bool, into: Latencies) -> None:
             # Even on a busy machine every block must arrive; up to half of them may still be under way.
             if int(reported) < 0.5 * BLOCKS_PER_S * seconds:
                 raise SystemExit(f'the page told of {reported} blocks in {seconds:g} s')
-    since = int(began * 1e9)
-    sent = dict(json.loads(published))
+    since, sent = int(began * 1e9), dict(json.loads(published))
     written = np.array(device.written)
     for topic, s, t in json.loads(heard):
         if t <= since:
@@ -333,8 +330,7 @@ def make_recording(folder: Path, minutes: float) -> tuple[Path, int]:
     with BagWriter(path, rig_values=dict(rig.values)) as bag:
         for first in range(0, n, step):
             counts: npt.NDArray[np.int32] = simulator.step(loads.take(step)).counts
-            seq = np.arange(first, first + step)
-            flags = np.zeros(step, np.uint8)
+            seq, flags = np.arange(first, first + step), np.zeros(step, np.uint8)
             chunk = RawChunk(seq, seq * 1_000_000 + 10**18, counts, flags, rig.converter.volts_per_count)
             for record in pipeline.process(chunk):
                 bag.put(record)

@@ -3,7 +3,6 @@
 """Compensator and shaper with the real controllers of ros2_control, on hardware that is mocked."""
 
 import subprocess
-import sys
 import time
 from typing import Any
 
@@ -171,7 +170,7 @@ def compensated(arm: Arm, programs: list[Program]) -> None:
         raise SystemExit('compensator: a step')
 
 
-def main() -> int:
+def main() -> None:
     arm, programs = Arm(), list[Program]()
     try:
         control = ['ros2', 'run', 'controller_manager', 'ros2_control_node', '--ros-args', '--params-file']
@@ -188,8 +187,7 @@ def main() -> int:
             program.end()
             print(*program.lines[-20:], sep='\n')
         arm.close()
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes docs/performance.md, and three rows of README, from bench/results.json and bench/cpu.json."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -94,11 +93,10 @@ def readme(text: str, rows: Sequence[Row]) -> str:
     return '\n'.join(next(lines) if line.endswith(PRINTED_BY) else line for line in text.split('\n'))
 
 
-def main() -> int:
+def main() -> None:
     README.write_text(readme(README.read_text(encoding='utf-8'), read(RESULTS)[0]), encoding='utf-8')
     PAGE.write_text(page(*read(RESULTS), *read(CPU)), encoding='utf-8')
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -14,9 +14,7 @@ import numpy as np
 from bench.rows import BY_HAND, Row, figure, keep, piped
 from psd_deflection.base.log import null_log
 
-SETTLE_S = 3.0
-TICK_S = 0.005
-WANTED = 32
+SETTLE_S, TICK_S, WANTED = 3.0, 0.005, 32
 
 
 class Still:
@@ -43,8 +41,7 @@ def devices(count: int) -> None:
     ports = [PseudoTerminal() for _ in range(count)]
     served = [SimulatedFrames(Still()) for _ in ports]  # type: ignore[arg-type]
     print(json.dumps([port.name for port in ports]), flush=True)
-    stop = until_stdin_closes()
-    start = time.monotonic_ns()
+    stop, start = until_stdin_closes(), time.monotonic_ns()
     while not stop.wait(TICK_S):
         for port, device in zip(ports, served, strict=True):
             now = time.monotonic_ns() - start

@@ -14,12 +14,10 @@ from psd_deflection.model.link.shapers import KINDS, Shaper, shaper
 from tools.program import ROOT
 
 FREQUENCY, RATIO = 12.0, 0.02
-GRAVITY = 9.81
-PAYLOAD = np.array([0.0, 0.0, -20.0])
+GRAVITY, PAYLOAD = 9.81, np.array([0.0, 0.0, -20.0])
 NAMES = ('shoulder', 'elbow')
 START, END = np.array([1.2, 0.6]), np.array([0.9, 1.0])
-MOVE_S = 0.4
-STEP_S = 0.002
+MOVE_S, STEP_S = 0.4, 0.002
 SETTLED_S = 6.0 * LAG_S  # After the last point the joints have arrived, s.
 WRONG = (0.95, 1.0, 1.05)  # The frequency that the shaper is made for, over the true one.
 

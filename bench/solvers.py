@@ -29,8 +29,7 @@ def best_of(action: Callable[[], Any], repeats: int = 5) -> float:
 
 def some_blocks(count: int) -> FloatArray:
     """Dots (count, 4), m, of poses within 2 mm and 2 degrees, with 2 um of noise."""
-    rng = np.random.default_rng(0)
-    poses = np.zeros((count, 5))
+    rng, poses = np.random.default_rng(0), np.zeros((count, 5))
     poses[:, :3] = rng.uniform(-1, 1, (count, 3)) * (2e-3, 2e-3, np.radians(2.0))
     return dots_of(thesis_geometry(), poses) + 2e-6 * rng.standard_normal((count, 4))
 
@@ -59,8 +58,7 @@ def peer_least_squares(dots: FloatArray) -> None:
 
 def peer_lstsq(dots: FloatArray) -> None:
     """numpy.linalg.lstsq on the linearised plate: no exact rotation, no covariance."""
-    geometry = thesis_geometry()
-    a = np.zeros((4, 3))
+    geometry, a = thesis_geometry(), np.zeros((4, 3))
     a[0::2, 0] = a[1::2, 1] = -1.0
     a[0::2, 2], a[1::2, 2] = geometry.beams[:, 1], -geometry.beams[:, 0]
     for m in dots:
@@ -77,8 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--blocks', type=int, default=1_000_000, help='blocks of the vectorised solve')
     blocks = parser.parse_args().blocks
-    geometry = thesis_geometry()
-    dots = some_blocks(blocks)
+    geometry, dots = thesis_geometry(), some_blocks(blocks)
     print(f'{blocks} blocks at once, with covariance, residual and status')
     seconds = []
     solver = make_solver('exact', geometry)
@@ -90,8 +87,7 @@ def main() -> None:
     ratio = peer / seconds[0]
     print(f'  {"scipy.optimize.least_squares a block":50} {1e6 * peer:9.1f} us, exact is {ratio:.0f} times as fast')
     print('one block at a time, with covariance')
-    sample = tuple(dots[0].tolist())
-    default = 0.0
+    sample, default = tuple(dots[0].tolist()), 0.0
     alike, unlike = ('', (4e-12,) * 4), (', x and y unlike', (4e-12, 1e-12, 9e-12, 2e-12))
     for name in (name for name in SOLVERS if name not in ('pose', 'base_pair')):
         solver = make_solver(name, geometry)

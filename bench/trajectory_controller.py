@@ -11,8 +11,7 @@ import numpy as np
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory
 from psd_deflection.records import FloatArray
 
-FEEDBACK_S = 0.05
-ACTION = '/joint_trajectory_controller/follow_joint_trajectory'
+FEEDBACK_S, ACTION = 0.05, '/joint_trajectory_controller/follow_joint_trajectory'
 
 
 def arriving(message: Any, names: Sequence[str]) -> tuple[float, Trajectory]:
@@ -40,8 +39,7 @@ class TrajectoryController:
         begins = stamp or now
         first = begins + path.times[0]
         if now < first:
-            here = np.zeros_like(path.states[:1])
-            same = min(orders, self._path.states.shape[1])
+            here, same = np.zeros_like(path.states[:1]), min(orders, self._path.states.shape[1])
             here[0, :same] = self.state(now)[:same]
             path = Trajectory(path.names, np.append(now - begins, path.times), np.concatenate([here, path.states]))
         self._path, self._begins = path, begins

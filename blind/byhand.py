@@ -64,8 +64,7 @@ def _held(levels: Array, times: Array, n: int) -> Array:
 
 
 def _moved(kind: str, times: Array, ends: float, rng: np.random.Generator) -> Array:
-    annotated = times.copy()
-    edges = np.concatenate(([0.5], times, [ends]))
+    annotated, edges = times.copy(), np.concatenate(([0.5], times, [ends]))
     which = [int(rng.integers(0, len(times)))] if kind == 'one' else range(len(times))
     for i in which:
         early = kind != 'late' and rng.random() < 0.5
@@ -84,8 +83,7 @@ def drawn(name: str) -> Hand:
     kind = name.split('-')[1]
     levels = _levels(rng, odd=kind == 'rounded')
     spans = rng.uniform(3.0, 14.0, len(levels))
-    times = np.round(np.cumsum(spans)[:-1], 3)
-    n = round(spans.sum() * RATE)
+    times, n = np.round(np.cumsum(spans)[:-1], 3), round(spans.sum() * RATE)
     effective = _held(levels, times, n)
     annotated, wrong = effective.copy(), list[dict[str, Any]]()
     if kind in ('late', 'mixed', 'one'):
@@ -112,8 +110,7 @@ def drawn(name: str) -> Hand:
             if np.any(np.abs(levels[i + 1] - reported_levels[i + 1]) > (0.2, 0.2, 0.1))
         ]
     elif kind in ('forgotten', 'twice'):
-        i = int(rng.integers(0, len(times) - 1))
-        reported_levels = levels.copy()
+        i, reported_levels = int(rng.integers(0, len(times) - 1)), levels.copy()
         # Never noted: the load before is held on. Noted twice: what was added is added once more.
         reported_levels[i + 1] = levels[i] if kind == 'forgotten' else 2.0 * levels[i + 1] - levels[i]
         annotated = _held(reported_levels, times, n)

@@ -164,7 +164,8 @@ def score(seed: int, lit: bool = False) -> Score:
     message = [n for n in reported & alone if package_shares.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
     moved = shifted(truth, group, rng) if group else truth
-    again = misaligned.record(moved, later_motion(rng), rng, outliers=0.01, light=light)
+    later_motion = misaligned.poses(misaligned.pushes(rng, 12, SECONDS))
+    again = misaligned.record(moved, later_motion, rng, outliers=0.01, light=light)
     checked = check([run_of(again)], rig)
     axes = np.abs(error) <= Z95 * np.sqrt(np.einsum('nii->ni', covariance))
     inside, noise_only = (float(np.mean(d <= CHI95)) for d in (distance, noise_distance))
@@ -248,10 +249,6 @@ def table_of_errors(scale: float, errors: Sequence[Mapping[str, float]]) -> Iter
     for words, part in (('gains', '.gain_'), ('all parameters', '')):
         z = np.array([v for e in errors for name, v in e.items() if part in name])
         yield f'| {scale:g} | {words} | {np.mean(np.abs(z) <= Z95):.1%} of {z.size} | {np.sqrt(np.mean(z**2)):.2f} |'
-
-
-def later_motion(rng: np.random.Generator) -> Array:
-    return misaligned.poses(misaligned.pushes(rng, 12, SECONDS))
 
 
 def table(scores: Sequence[Score]) -> Iterator[str]:

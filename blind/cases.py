@@ -187,8 +187,7 @@ def gap_of(design: tuple[Generator, ...], effect: Mapping[str, Any]) -> float:
     """Gap in floors that this effect alone makes, without noise."""
     total, count = 0.0, 0
     for g in design:
-        v = g.clean([effect])
-        nominal = g.clean([])
+        v, nominal = g.clean([effect]), g.clean([])
         if effect['name'] in ('amplifier_saturation', 'quantisation'):
             # These act on the noisy signal; with the same noise on both, the difference is the effect.
             hiss = generator.noise(len(v), 'white', 12345)
@@ -274,8 +273,7 @@ def cases_of_many(first: int, count: int, effects: int, seed: int) -> Iterator[C
     for i in range(first, first + count):
         names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], effects, replace=False)]
         gaps = np.exp(rng.uniform(math.log(3.0), math.log(30.0), effects)).tolist()
-        two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
-        wanted = tuple(zip(names, gaps, strict=True))
+        two, wanted = bool(set(names) & SHOWS_ACROSS_LENGTHS), tuple(zip(names, gaps, strict=True))
         yield Case(f'{kind}-{i}-{"-".join(names)}', kind, 'two' if two else 'one', wanted)
 
 
@@ -308,8 +306,7 @@ def hard_cases(first: int, spreads: int, mistakes: int) -> Iterator[Case]:
     for i in range(first, first + spreads):
         gaps = SPREADS[i % len(SPREADS)]
         names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], len(gaps), replace=False)]
-        two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
-        wanted = tuple(zip(names, gaps, strict=True))
+        two, wanted = bool(set(names) & SHOWS_ACROSS_LENGTHS), tuple(zip(names, gaps, strict=True))
         yield Case(f'spread-{i}-{"-".join(names)}', 'spread', 'two' if two else 'one', wanted)
     for name, sizes in MISTAKES.items():
         for k in range(min(mistakes, len(sizes))):

@@ -302,8 +302,7 @@ def warming(reported: bool = True, rest_s: int = 60, steps: int = 8, seed: int =
 
 def on_a_moving_base(seconds: int = 60, seed: int = 1) -> Inside:
     """A link without load whose base turns, as :func:`blind.motion.swung` moves it; its accelerations are told."""
-    made = moving.make('joint', float(seconds), seed)
-    pipeline = Pipeline(moving.rig_of())
+    made, pipeline = moving.make('joint', float(seconds), seed), Pipeline(moving.rig_of())
     reported = list(made.reported)
     records: list[object] = []
     for part in np.split(np.arange(len(made.volts)), len(made.volts) // SIZE):
@@ -340,8 +339,7 @@ def random_motion(low: float, high: float, rms: float, seconds: int = 60, seed: 
 def coarse(poses: int = 150, seed: int = 1, *, reported: bool = True, **overrides: object) -> Inside:
     """Return a 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses.
     ``reported``: the rig file says so, not 16 bit."""
-    rng = np.random.default_rng(seed)
-    row = Row('10 bit', bits=10)
+    rng, row = np.random.default_rng(seed), Row('10 bit', bits=10)
     more = {'converter.bits': 10 if reported else 16, **overrides}
     runs = []
     for _ in range(poses):

@@ -106,8 +106,7 @@ def stlsq(plant: Plant, y: FloatArray, observed: BoolArray) -> FloatArray:
     table /= np.sqrt(np.mean(table[observed] ** 2, axis=0))
     always, count, best = len(plant.nuisance), int(observed.sum()), (np.inf, y)
     for threshold in THRESHOLDS:
-        keep = np.ones(table.shape[1], dtype=bool)
-        sizes = np.zeros(table.shape[1])
+        keep, sizes = np.ones(table.shape[1], dtype=bool), np.zeros(table.shape[1])
         for _ in range(20):
             sizes[:] = 0.0
             a, b = table[observed][:, keep], (y - nothing)[observed]

@@ -16,8 +16,7 @@ from blind import law_forms
 
 Array = npt.NDArray[np.float64]
 Spec = Mapping[str, Any]
-RATE = 1000.0
-FINER = 5
+RATE, FINER = 1000.0, 5
 STEP = 1.0 / (RATE * FINER)
 EI = 69e9 * math.pi / 4.0 * (0.0159**4 - 0.0138**4)
 GJ = 24e9 * math.pi / 2.0 * (0.0159**4 - 0.0138**4)
@@ -58,8 +57,7 @@ def _march(a: Array, b: Array, held: Array, start: Array) -> Array:
         first.append(x)
         second.append(v)
         x, v = p11 * x + p12 * v + q1 * u, p21 * x + p22 * v + q2 * u
-    at_samples = np.column_stack((first, second))
-    out = np.empty((len(held), FINER, 2))
+    at_samples, out = np.column_stack((first, second)), np.empty((len(held), FINER, 2))
     for j in range(FINER):
         out[:, j] = at_samples @ reach[j].T + held @ push[j].T
     return out.reshape(-1, 2)
@@ -125,8 +123,7 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
     for name, lever in (('tip_force', give_b), ('mount_tilt', length)):
         for e in find(effects, name):
             sag[:2] += e['x'] * lever, e['y'] * lever
-    pose = np.empty((len(loads) * FINER, 3))
-    creeps = find(effects, 'creep')
+    pose, creeps = np.empty((len(loads) * FINER, 3)), find(effects, 'creep')
     for axis, (frequency, ratio) in enumerate(((f_b, z_b), (f_b, z_b), (f_t, z_t))):
         a2, b2 = _oscillator(frequency, ratio)
         rows = static[:, axis]

@@ -3,7 +3,6 @@
 """The cases of the blind suite as files, for any tool: ``python -m blind.given --out DIR``."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -46,18 +45,15 @@ def given(job: tuple[Case, str, str]) -> str:
     return case.key
 
 
-def main() -> int:
+def main() -> None:
     parser = options(__doc__, jobs=1)
-    chosen = selection(parser)
-    args = parser.parse_args()
-    folder = Path(args.out)
-    cases = chosen(args)
+    chosen, args = selection(parser), parser.parse_args()
+    folder, cases = Path(args.out), chosen(args)
     print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
     jobs = [(case, str(folder / 'sealed' / f'{case.key}.json'), str(folder / 'cases')) for case in cases]
     for _ in over(given, jobs, args.jobs, 'cases'):
         pass
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -8,7 +8,7 @@ import math
 import sys
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.search.screen import SignatureBank
 
-_BANK = SignatureBank()
-STAGES = tuple(law_forms.OF_STAGE)
+_BANK, STAGES = SignatureBank(), tuple(law_forms.OF_STAGE)
 WANTED = {'stage': 0.90, 'variables': 0.90, 'gap': 0.80, 'alarm': 0.0}
 MOST_FLOORS = 1.2
 UNDER_ONE = 0.99
@@ -43,15 +42,12 @@ def drawn(first: int, count: int) -> list[dict[str, Any]]:
         unused = [f for f in law_forms.OF_STAGE[stage] if f not in used] or list(law_forms.OF_STAGE[stage])
         form = str(rng.choice(unused))
         used.add(form)
-        law = next(filter(_shows, (law_forms.draw(zlib.crc32(text.encode()), stage, form) for text in _seeds(i))))
+        # The second if the first law does nothing, and so on.
+        texts = (f'law-{i}' + (f'-{again}' if again else '') for again in itertools.count())
+        law = next(filter(_shows, (law_forms.draw(zlib.crc32(text.encode()), stage, form) for text in texts)))
         gap = float(np.exp(rng.uniform(math.log(5.0), math.log(30.0))))
         out.append({**law, 'number': i, 'gap': gap})
     return out
-
-
-def _seeds(number: int) -> Iterator[str]:
-    """Texts to draw a law from: the second if the first law does nothing, and so on."""
-    return (f'law-{number}' + (f'-{again}' if again else '') for again in itertools.count())
 
 
 def _shows(law: dict[str, Any]) -> bool:

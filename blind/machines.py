@@ -65,8 +65,7 @@ class Emps(Plant):
         position = rows[: count * n, 1].reshape(count, n)
         self._voltage = rows[: count * n, 2].reshape(count, n)
         # Speed at the start of each segment, from a polynomial through 80 ms on either side.
-        speed = np.zeros(count)
-        reach = 80
+        speed, reach = np.zeros(count), 80
         for i in range(1, count):
             around = rows[i * n - reach : i * n + reach + 1, 1]
             speed[i] = np.polyfit(np.arange(-reach, reach + 1) / RATE, around, 4)[3]

@@ -43,8 +43,7 @@ def _rig(name: str) -> Make:
 
 
 def _zero(size: float, o: Observation, rng: np.random.Generator) -> list[Observation]:
-    signs = rng.choice((-1.0, 1.0), 4)
-    shift = np.zeros(6)
+    signs, shift = rng.choice((-1.0, 1.0), 4), np.zeros(6)
     shift[[0, 1, 3, 4]] = size / o.rig.amplifier.sensitivity * signs * rng.uniform(0.5, 1.0, 4)
     half = len(o.volts) // 2
     first = dataclasses.replace(o, name='first', volts=o.volts[:half], loads=o.loads[:half])

@@ -36,8 +36,7 @@ def rung(link: Link, rng: np.random.Generator, seconds: float = 10.0, steps: int
     for i, start in enumerate(np.sort(rng.uniform(0.2, seconds - 2.0, steps))):
         size = float(rng.uniform(0.5e-3, 3e-3)) * float(rng.choice([-1.0, 1.0]))
         size = weight * (-1.0) ** i if equal else size
-        since = np.clip(t - start, 0.0, None)
-        moved = np.ones(len(t))
+        since, moved = np.clip(t - start, 0.0, None), np.ones(len(t))
         for hertz, zeta, share in link.modes:
             w = 2.0 * np.pi * hertz
             w_damped = w * np.sqrt(1.0 - zeta**2)

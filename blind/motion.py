@@ -22,8 +22,7 @@ from psd_deflection.rig.config import Rig, load_rig
 LENGTH = 0.585
 GIVES = (LENGTH**3 / (3.0 * EI), LENGTH**3 / (3.0 * EI), LENGTH / GJ)
 MODES = ((14.0, 0.02), (14.0, 0.02), (21.0, 0.02))
-REST = 3.0
-BLOCK = 20
+REST, BLOCK = 3.0, 20
 AXES = ('dX', 'dY', 'theta')
 KINDS = ('steps', 'chirp', 'operation', 'joint')
 UNTOLD = 'untold'  # As ``joint``, but the filter is told nothing.
@@ -52,8 +51,7 @@ class Run:
 def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
     """Loads (n, 3), N, N, N m; each is held for a sample."""
     n, rest = int(seconds * RATE), int(REST * RATE)
-    out = np.zeros((n, 3))
-    most = np.array([20.0, 20.0, 2.0])
+    out, most = np.zeros((n, 3)), np.array([20.0, 20.0, 2.0])
     if kind == 'steps':
         for axis in range(3):
             at = rest

@@ -51,8 +51,7 @@ def observed(
 def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
     """Return the effect ``name`` hidden in the first recording ``design``: what became of it."""
     name, design, gap = job
-    start = time.perf_counter()
-    seed = zlib.crc32(f'{name}-{design}'.encode())
+    start, seed = time.perf_counter(), zlib.crc32(f'{name}-{design}'.encode())
     loads, temperature = first_recordings()[design]
     generator = (Generator(loads, temperature, RIG.link.length),)
     row: dict[str, Any] = {'effect': name, 'design': design, 'gap': 0.0}

@@ -198,8 +198,7 @@ def together(fine: Array, scene: Scene) -> Array:
 
 def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
     """Grey levels without noise: the mean over ``poses``, which are equal parts of the exposure."""
-    parts = max(round(PARTS / math.sqrt(len(poses))), 2)
-    fine = cut(scene)
+    parts, fine = max(round(PARTS / math.sqrt(len(poses))), 2), cut(scene)
     exposed = np.zeros((fine.height, fine.width))
     for pose in poses:
         cover(exposed, fine, pose, parts)

@@ -85,7 +85,7 @@ def covered(row: Row) -> list[tuple[str, bool]]:
             # With other choices it is another effect, whose parameters are not those of the truth.
             if any(k in t and isinstance(v, int) and int(t[k]) != v for k, v in fitted.items()):
                 continue
-            known = {f'amplitude_{c}': v for c, v in zip(CHANNELS, t.get('amplitude', ()), strict=False)} | t
+            known = {f'amplitude_{c}': v for c, v in zip(CHANNELS, np.ravel(t.get('amplitude', ())), strict=False)} | t
             for name, value in fitted.items():
                 if isinstance(value, dict) and value['sd'] > 0.0 and name in known:
                     inside = abs(value['value'] - float(known[name])) <= 1.96 * value['sd']

@@ -91,8 +91,7 @@ def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
 def watch_run(job: tuple[str, int]) -> Run:
     kind, seed = job
     load, volts, event = happened(kind, seed)
-    held = round(HELD_FROM_S * RATE)
-    chain = Chain()
+    held, chain = round(HELD_FROM_S * RATE), Chain()
     chain.load((0.0, 0.0, 0.0))
     chain.feed(volts[:held])
     chain.load(load)
@@ -109,8 +108,7 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
     is given block means of the second generator's clean readings with fresh noise, as much as a block's fit leaves, and
     the poses that the method has for them: a day of samples would take the pipeline half an hour."""
     hours, seed = job
-    rng = np.random.default_rng(seed)
-    rig = load_rig()
+    rng, rig = np.random.default_rng(seed), load_rig()
     solver = solver_from_rig('exact', rig)
     compliance = Pipeline(rig).tip_loads.compliance
     watch = Watch(rig, compliance)

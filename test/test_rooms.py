@@ -4,6 +4,7 @@
 
 import ast
 import importlib
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from unittest.mock import Mock
 import pytest
 
 import psd_deflection
+from blind.sweep import declared
 from tools.mutants_by_hand import hand_made
 from tools.tiers import ROOMS
 
@@ -28,6 +30,17 @@ def test_no_class_name_stands_for_two_things() -> None:
                     places[node.name].append(str(path.relative_to(ROOT)))
     assert len(places) > 300
     assert {name: modules for name, modules in places.items() if len(modules) > 1} == {}
+
+
+def test_each_threshold_has_unit_reason_trade_and_a_use() -> None:
+    listed = list(declared())
+    # Less than 80 with the ten of the predictive mean, which no other module shares.
+    assert 60 < len(listed) < 70
+    assert [(name, words) for _, name, words in listed if len(words) != 3 or '' in words] == []
+    studies = ROOT / 'psd_deflection' / 'studies'
+    paths = [path for room in ('discover', 'loads') for path in (studies / room).rglob('*.py')]
+    text = '\n'.join(path.read_text(encoding='utf-8') for path in paths if path.name != 'thresholds.py')
+    assert [name for _, name, _ in listed if len(re.findall(rf'\b{name}\b', text)) < 2] == []
 
 
 def test_each_mutant_made_by_hand_changes_a_line_of_a_room() -> None:

@@ -30,8 +30,7 @@ def expected(number: int) -> tuple[int, ...]:
 
 def dialogue(port: str) -> tuple[int, float]:
     """Request every answer in docs/protocol.md; return the bad frames and the median round trip of a PING, s."""
-    line = SerialPort(port, 921_600)
-    decoder = protocol.FrameDecoder()
+    line, decoder = SerialPort(port, 921_600), protocol.FrameDecoder()
     bad = 0
 
     def until(kind: type[protocol.Frame], record: list[protocol.Frame] | None = None) -> protocol.Frame:

@@ -22,8 +22,7 @@ from psd_deflection.records import FloatArray, IntArray
 from tools.program import Program
 
 BIN = Path(sys.executable).parent
-WINDOW = '1500x900'
-VIEWER_S = 180.0
+WINDOW, VIEWER_S = '1500x900', 180.0
 LIGHT = (255, 80, 60)
 SHARE = 5e-4
 """Minimum share of pixels in a trace's colour (measured: 2e-3); an empty viewport has a few, from its icons."""
@@ -66,8 +65,7 @@ def check_poses(written: Written, recording: Recording) -> int:
     series = recording.estimates()['/link_tip/deflection_with_covariance']
     if series.covariance is None:
         raise SystemExit('FAILED: the recording has no covariance')
-    breaks = 0
-    step = float(np.median(np.diff(series.t_ns)))
+    breaks, step = 0, float(np.median(np.diff(series.t_ns)))
     gone = np.flatnonzero(np.diff(series.t_ns) > 1.5 * step)
     for i, (name, _, _, scale, _) in enumerate(POSE):
         times, counts, values = written.rows(f'tip/{name}', 'Scalars:scalars')

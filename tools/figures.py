@@ -51,8 +51,7 @@ STEP, DARK, END = 3.095, (3.4, 3.6), 3.8  # s: when the load is switched, when l
 def switched(target: str) -> None:
     loads = np.zeros((int(END * RATE), 3))
     loads[int(STEP * RATE) :, 0] = 10.0
-    run = motion.run_of(loads, 1)
-    dark = slice(*(int(t * RATE) for t in DARK))
+    run, dark = motion.run_of(loads, 1), slice(*(int(t * RATE) for t in DARK))
     means = motion.pose_of(run.volts).reshape(-1, motion.BLOCK, 3).mean(axis=1)
     run.volts[dark, 3:] = 0.0
     pipeline = Pipeline(motion.rig_of())
@@ -89,8 +88,7 @@ CHANNELS = {'x1': 0, 'y1': 1, 'x2': 3, 'y2': 4}
 
 def events(target: str) -> None:
     figure = Figure(figsize=(10, 3.2), layout='constrained')
-    axes = figure.subplots(1, len(SIZES))
-    held = round(HELD_FROM_S * RATE)
+    axes, held = figure.subplots(1, len(SIZES)), round(HELD_FROM_S * RATE)
     for axis, (kind, size) in zip(axes, SIZES.items(), strict=True):
         load, volts, event = happened(kind, SEED)
         chain = Chain()

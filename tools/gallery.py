@@ -34,8 +34,7 @@ ALIKE = re.compile(r'[\w.]*\d[\w.]*|[+\-−]?Δ?[XYθ]\b|[+\-−](?=#)')
 """What lines of the same kind differ in: names of channels and axes, numbers."""
 LONGEST = 80  # Characters of a line; the rest is cut.
 WIDTH = 760  # Pixels of a picture, as wide as the column of the site.
-COLOURS = 24
-RATE_HZ = 1000
+COLOURS, RATE_HZ = 24, 1000
 Columns = dict[str, npt.NDArray[np.float64]]
 """A CSV recording, column by column."""
 

@@ -196,8 +196,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--by-hand', action='store_true', help=f'instead: those of {BY_HAND.name}')
     parser.add_argument('--quick', action='store_true', help='without the slow tests')
     parser.add_argument('--python', default=sys.executable, help='the Python that runs the tests (default this one)')
-    arguments = parser.parse_args(argv)
-    known = equivalent()
+    arguments, known = parser.parse_args(argv), equivalent()
     good = True
     print('| room | mutants | equivalent | noticed: quick | slow | of those that count |')
     print('|---|---|---|---|---|---|', flush=True)

@@ -113,8 +113,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('rosdistro', type=Path)
     parser.add_argument('--tools', type=Path, default=ROOT / 'build/bloom', help='environment with rosdep')
-    options = parser.parse_args(argv)
-    table = rosdep_table(ROOT)
+    options, table = parser.parse_args(argv), rosdep_table(ROOT)
     package = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
     needed = [e.text or '' for e in package if e.tag.endswith('depend')]
     problems: list[str] = []

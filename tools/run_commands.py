@@ -294,8 +294,7 @@ class Reader:
         """Type the lines of a block one after the other; ``ran`` gets the seconds and, after a failure, the reason."""
         try:
             for line in lines:
-                began = time.monotonic()
-                failed = ''
+                began, failed = time.monotonic(), ''
                 try:
                     with self._room.typing(line) if self._room else contextlib.nullcontext():
                         self.type(filled(line, CUT))
@@ -410,8 +409,7 @@ def main() -> int:
     options = {NO_CAMPAIGNS, CLEAN}
     campaigns = NO_CAMPAIGNS not in sys.argv
     only = ' '.join(word for word in sys.argv[1:] if word not in options)
-    environment = Path(sys.prefix)
-    failures = 0
+    environment, failures = Path(sys.prefix), 0
     with tempfile.TemporaryDirectory() as temporary, ros_domain() as domain:
         folder = Path(temporary) / 'checkout'
         copy_checkout(folder, '--cached', '--others', '--exclude-standard')

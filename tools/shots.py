@@ -5,7 +5,6 @@
 import argparse
 import contextlib
 import re
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,8 +19,7 @@ FIGURES = Path(__file__).resolve().parents[1] / 'docs' / 'figures'
 THETA = 'return document.getElementById("theta").textContent'
 LOADED = r'\u22129[34]\d\.\d+'
 """The twist in mdeg when 50 N hang on the sidebar, which they do every ``LOAD_PERIOD_S``."""
-LOAD_PERIOD_S = 36.0
-BLOCKS_PER_S = 50.0
+LOAD_PERIOD_S, BLOCKS_PER_S = 36.0, 50.0
 DESK, PHONE = (1440, 900), (390, 844, 2.0, 'light', True)
 
 
@@ -76,7 +74,7 @@ def drawn(seconds: float) -> Callable[[Any], bool]:
     return lambda driver: int(driver.execute_script('return document.body.dataset.rows ?? 0')) >= BLOCKS_PER_S * seconds
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
     seconds = parser.parse_args().seconds
@@ -94,8 +92,7 @@ def main() -> int:
                 take(url, 'monitor_away', DESK, 3.0, away_without(device))
         finally:
             device.end()
-    return 0
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

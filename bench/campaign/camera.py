@@ -388,8 +388,7 @@ def main() -> int:
     parser.add_argument('--only', choices=('adverse', 'accuracy', 'boards', 'cost'))
     args = parser.parse_args()
     opencv().setNumThreads(1)
-    began = time.perf_counter()
-    fine = True
+    began, fine = time.perf_counter(), True
     if args.only in (None, 'accuracy'):
         fine &= accuracy_table(min(args.frames // 10, 200), args.seed)
     if args.only == 'boards' or (args.only is None and args.frames >= 100):

@@ -283,8 +283,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault('y1 saturated', _while(0.15, optics={1: 32767}), ('rejected: saturated',), estimates=True),
     Fault('psd_2 stands still', _while(0.25, freeze=True), (*STILL,), estimates=True),
 )
-START_S = 300.0
-RECOVER_S = 5.0
+START_S, RECOVER_S = 300.0, 5.0
 BACK_S = 1.0  # A device that is back is read again within this.
 
 

@@ -126,8 +126,7 @@ class Campaign(Graph):
         self.plant.late = False
         if name in OWN:
             return self._own(name), False
-        began = time.time()
-        end = self._begin(name)
+        began, end = time.time(), self._begin(name)
         self.spin(WATCHED_S)
         held = max(self._changed_last() - began, 0.0)
         if name == 'joints do not follow':
@@ -354,8 +353,7 @@ def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
     """Inject each of them so often, and print a line for each. How often it held or released later than it must, and
     the largest step over what the rate allows."""
     late = slow = 0
-    worst = 0.0
-    campaign = Campaign()
+    worst, campaign = 0.0, Campaign()
     try:
         campaign.enable()
         for name in names:

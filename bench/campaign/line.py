@@ -21,13 +21,10 @@ from psd_deflection.devices.protocol import frames as protocol
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.records import CHANNELS
 
-RATE = 1000
-SERIAL = 'CAMPAIGN-1'
+RATE, SERIAL = 1000, 'CAMPAIGN-1'
 VOLTS_PER_COUNT = 10.0 / 32768
 DIGIT = 4096  # Identities are written in two digits to this base: (id // base) in x2, (id % base) in x1.
-LOOK_S = 0.005
-QUIET_LOOKS = 5
-READ_LIMIT_S = 5.0
+LOOK_S, QUIET_LOOKS, READ_LIMIT_S = 0.005, 5, 5.0
 Tamper = Callable[[int, bytes], bytes | None]
 """What becomes of a sample's frame on the line; None where it arrives as it is."""
 

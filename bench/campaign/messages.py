@@ -192,8 +192,7 @@ def attack(name: str, args: argparse.Namespace) -> int:
         os.environ.update({'ROS_LOG_DIR': place, 'XDG_STATE_HOME': place})
         inside = Inside(name, args.seed, Path(place))
         try:
-            grown = inside.run(60.0 * args.minutes)
-            faults = inside.attacked.faults()
+            grown, faults = inside.run(60.0 * args.minutes), inside.attacked.faults()
             if grown > MOST_GROWTH:
                 faults.append(f'it grew by {grown / 1e6:.1f} MB')
             if inside.attacked.rejected() < inside.undecodable:

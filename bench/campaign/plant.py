@@ -30,8 +30,7 @@ from tools.program import ROOT, Program
 NAMES = ('shoulder', 'elbow')
 NOMINAL = np.array([1.2, 0.6])
 LOAD = (0.0, 0.0, -40.0)  # N, at the end effector.
-PERIOD_S = 0.02
-NOISE = 1e-6
+PERIOD_S, NOISE = 0.02, 1e-6
 MAX_RATE, FOLLOW_ERROR = CompensatorSettings().max_rate, CompensatorSettings().follow_error
 LATE_S = 0.05
 """With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
@@ -216,8 +215,7 @@ class Plant:
 
 
 URDF = ROOT / 'config' / 'two_links.urdf'
-LONGEST_S = 60.0
-ASK_AGAIN_S = 5.0
+LONGEST_S, ASK_AGAIN_S = 60.0, 5.0
 READY = 'once it is enabled'  # What the compensator logs when it can be enabled.
 BREAKS = """
 import sys, time

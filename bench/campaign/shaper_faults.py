@@ -26,8 +26,7 @@ MOVE_S = 0.6
 LARGEST = 0.4  # Of a joint, rad.
 FASTEST = 1.5 * 2.0 * LARGEST / (MOVE_S - 0.1)
 """Of a cubic from one end to the other within the time that is left of it, rad/s."""
-STEP_S = 0.002
-LONGEST_S = 60.0
+STEP_S, LONGEST_S = 0.002, 60.0
 Change = Callable[[Any], object]
 
 

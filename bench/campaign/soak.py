@@ -28,12 +28,8 @@ from psd_deflection.run.acquisition import Acquisition
 from psd_deflection.run.arrivals import Arrival
 from tools.program import PSD_DEFLECTION, Program
 
-SKEW = 30e-6
-MS = 1_000_000
-START_S = 300.0
-SETTLED_S = 180
-ALLOWED_STD_NS = 50_000
-ALLOWED_GROWTH = 2_000_000
+SKEW, MS, START_S = 30e-6, 1_000_000, 300.0
+SETTLED_S, ALLOWED_STD_NS, ALLOWED_GROWTH = 180, 50_000, 2_000_000
 
 
 def resident(pid: int) -> int:
@@ -161,8 +157,7 @@ def real_time(minutes: float) -> bool:
 def simulated_time(hours: float) -> bool:
     rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
     acquisition = Acquisition(rig, texts(lambda text: print(f'  said: {text}')))
-    pipeline = Pipeline(rig)
-    decoder = protocol.FrameDecoder()
+    pipeline, decoder = Pipeline(rig), protocol.FrameDecoder()
     decoder.feed(b'\x00')
     rng = np.random.default_rng(4)
     once_a_second = protocol.encode(hello_of('SOAK')) + protocol.encode(protocol.StatusFrame(0, 2150))

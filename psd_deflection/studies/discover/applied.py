@@ -20,23 +20,12 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import note_finding
 from psd_deflection.studies.discover.hidden import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import CERTAIN_SD, HALF, LEAST_REPORTED, UNKNOWN_SD
 from psd_deflection.studies.loads.annotated_times import CorrectedNote, MeasuredLoad, shifted
 from psd_deflection.studies.loads.effective import SwayingLoad, swaying
 from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, WrongNote, find_holds, implied_loads
 
-FREE_MOMENTS = 40.0
-"""How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
-FREE = 100.0
-"""N or N m: standard deviation of a load that nobody knows."""
-PULSE = 1000.0
-"""N or N m: standard deviation of a load that acts for one sample; it makes a link of 14 Hz ring as 90 N do."""
-LONGER = 0.5
-"""A mode rings longer than the rig file says if it decays at less than this share of that rate."""
 RINGING = 'ringing after what is left out'
-SIGNIFICANT = 4.0
-"""Standard deviations by which a load that is told differs from the annotated one."""
-LEAST_REPORTED = (0.02, 0.02, 0.01)
-"""N, N, N m: a smaller difference is not reported."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -61,7 +50,7 @@ def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: Impli
 
 def directions(ws: Workspace, wrong: Sequence[Hold]) -> list[LoadDirection]:
     """Any load in each of ``wrong``, and the times at which it was hung and taken off if nobody noted them."""
-    free, out = np.full(3, FREE), list[LoadDirection]()
+    free, out = np.full(3, UNKNOWN_SD), list[LoadDirection]()
     for p in wrong:
         o = ws.observations[p.recording]
         out += of_hold(o, p.recording, p, free)
@@ -85,7 +74,7 @@ def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDir
     none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
     changes = [effective([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
     return [
-        LoadDirection(recording, csc_array(change), FREE_MOMENTS, note, axis, effective, none)
+        LoadDirection(recording, csc_array(change), UNKNOWN_SD, note, axis, effective, none)
         for axis, change in enumerate(changes)
     ]
 
@@ -119,9 +108,9 @@ def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) 
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=False):
         for axis, ((_, usual), (frequency, decay)) in enumerate(zip(stated, now, strict=True)):
             for before in (1, 1 + round(0.25 / (frequency * o.period))):
-                if decay < LONGER * usual and last - before >= first:
+                if decay < HALF * usual and last - before >= first:
                     change = _at(o, slice(last - before, last - before + 1), axis)
-                    out.append(LoadDirection(recording, change, PULSE, RINGING, axis, swings=True))
+                    out.append(LoadDirection(recording, change, UNKNOWN_SD, RINGING, axis, swings=True))
     return out
 
 
@@ -148,7 +137,7 @@ def wrong_load_findings(ws: Workspace, wrong: Sequence[Hold]) -> list[Finding]:
         o = ws.observations[p.recording]
         note = WrongNote(_timed(ws, p), p.of(o.loads), o.period)
         sd = np.array([sds.get((id(p), axis), 0.0) for axis in range(3)])
-        if np.any(note.off > np.maximum(SIGNIFICANT * sd, LEAST_REPORTED)):
+        if np.any(note.off > np.maximum(CERTAIN_SD * sd, LEAST_REPORTED)):
             out.append(note_finding(note, o.name))
     return out
 

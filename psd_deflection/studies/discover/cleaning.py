@@ -21,17 +21,11 @@ from psd_deflection.records import FloatArray, channel_names, dot_channels
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.search.proposals import coarse_step
+from psd_deflection.studies.discover.thresholds import PASSES, STUCK_S
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads, correct_loads
+from psd_deflection.studies.loads.thresholds import OUTLIER_SD, SLIGHT
 
-FAR = 8.0
-"""A sample this many standard deviations from what its neighbours predict is an outlier."""
-PASSES = 6
-"""Outliers next to each other are found one after the other."""
 _TO_SD = 1.4826
-STUCK_S = 0.03
-"""A channel that keeps the same converter count for so long is stuck."""
-UNKNOWN_SHARE = 0.05
-"""Report a recording whose loads are unknown for more than this share of its time."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -56,7 +50,7 @@ def outliers(residual: FloatArray, least: float) -> BoolArray:
             if gone.any():
                 x[gone] = CubicSpline(at[~gone], residual[~gone, c])(at[gone])
             apart = _from_cubic(x)
-            limit = FAR * max(_TO_SD * float(np.median(apart)), least)
+            limit = OUTLIER_SD * max(_TO_SD * float(np.median(apart)), least)
             candidate = maximum_filter1d(apart, 5) > limit
             distance = np.where(candidate & ~gone, np.abs(x - median_filter(x, 5)), 0.0)
             worst = (distance > 0.5 * limit) & (distance >= maximum_filter1d(distance, 5))
@@ -143,7 +137,7 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     volts[:before] = np.nan
     volts[len(volts) - after :] = np.nan
     share = (before + after) / len(volts)
-    if share > UNKNOWN_SHARE:
+    if share > SLIGHT:
         ends = [f'{name} {k * o.period:.2f} s' for name, k in (('first', before), ('last', after)) if k]
         findings.append(
             Finding(

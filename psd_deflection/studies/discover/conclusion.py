@@ -33,7 +33,7 @@ from psd_deflection.studies.check.shared_findings import LOADS
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover import rehearsal as rehearsing
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP
-from psd_deflection.studies.discover.laws import WRITTEN, FoundLaw
+from psd_deflection.studies.discover.laws import FoundLaw
 from psd_deflection.studies.discover.redundant import STAGES
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
@@ -52,6 +52,7 @@ from psd_deflection.studies.discover.trees import (
     parameters_of,
     size_of,
 )
+from psd_deflection.studies.loads.thresholds import AS_GOOD
 from psd_deflection.studies.study import GIVEN_RIG, Notify, StudyResult, described, edited_rig_file, named, warn_caller
 
 SHOWN = 1e-3
@@ -305,7 +306,7 @@ class RigConclusion(Conclusion):
     @property
     def model_of_law(self) -> Law | None:
         """The law by the name that it gets; None if there is none, or if it leaves too much to be a model."""
-        if self.law is None or self.law.heldout_gap > WRITTEN * self.gap_floor:
+        if self.law is None or self.law.heldout_gap > AS_GOOD * self.gap_floor:
             return None
         return self.law.adopted(self.adopted or 'law')
 

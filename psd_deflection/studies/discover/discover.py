@@ -39,7 +39,7 @@ from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut, refit
 from psd_deflection.studies.discover.search.screen import SignatureBank
-from psd_deflection.studies.discover.search.weighing import SIGNIFICANT, NamedEffect, coincidences, unknown_of
+from psd_deflection.studies.discover.search.weighing import NamedEffect, coincidences, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import finding_of_effect, noise_of
 from psd_deflection.studies.discover.steps import (
@@ -52,22 +52,11 @@ from psd_deflection.studies.discover.steps import (
     where,
     without_effect,
 )
+from psd_deflection.studies.discover.thresholds import MANY_EFFECTS, ROUNDS, SIGNIFICANT
 from psd_deflection.studies.loads.alignment import SKEW
 from psd_deflection.studies.loads.holds import all_free, may_be_rounded, rounded
 from psd_deflection.studies.loads.plate_motion import dots_of
-
-FREE_FROM = 10.0
-"""A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
-CLOSED = 0.2
-"""Free loads are the answer if they and the effects beside them leave less than this share of it."""
-TURNS, MOST_SETTLED, SETTLED, AT_FLOOR = 2, 4, 0.95, 1.05
-"""Free loads are settled in so many turns, then sizes beside them, so often at most: until a gap of this share of that
-before is left, or of this many floors.
-"""
-FOLLOWED = 4
-"""So many known effects are asked, to first order, whether they make the gap."""
-FOLLOWS = 0.1
-"""Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""
+from psd_deflection.studies.loads.thresholds import MANYFOLD, MINOR, PART, SLIGHT
 
 
 def effective_loads(problem: Problem) -> Problem:
@@ -91,7 +80,7 @@ def effective_loads(problem: Problem) -> Problem:
 def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     """Return the free loads as ``fit`` asks for, and the sizes of its effects beside them, in turns."""
     gap = ws.gap(fit.difference)
-    for _ in range(MOST_SETTLED):
+    for _ in range(MANY_EFFECTS):
         # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
         next_ws, better = _refitted(ws, fit)
         if fit.effects:
@@ -100,14 +89,14 @@ def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
         if gap > previous_gap:
             break
         ws, fit = next_ws, better
-        if gap > SETTLED * previous_gap or gap < AT_FLOOR * ws.floor():
+        if gap > (1.0 - SLIGHT) * previous_gap or gap < (1.0 + SLIGHT) * ws.floor():
             break
     return ws, fit
 
 
 def _refitted(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     """Return the free loads as ``fit`` asks for, and what it leaves then: never more than before."""
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         next_ws = ws.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
         next_ws = ws.refitted(fit.difference) if next_ws is ws else next_ws
         residual, difference = next_ws.residual([*next_ws.base, *fit.coefficients_with_nuisance])
@@ -173,7 +162,7 @@ def _searched(problem: Problem) -> Problem:
         problem = step(problem)
     with_free = _with_all_loads_free(problem, had=asked)
     before = problem.comparison.gap(problem.fit.difference)
-    if with_free is not None and with_free.comparison.gap(with_free.fit.difference) < CLOSED * before:
+    if with_free is not None and with_free.comparison.gap(with_free.fit.difference) < PART * before:
         return _as_annotated(problem, with_free)
     # A detector at fault may move the dots by more than rounded loads move the plate.
     with_free = _with_all_loads_free(problem, maybe_rounded=True) if with_free is None and asked is None else None
@@ -199,16 +188,16 @@ def _follows_nothing(problem: Problem) -> bool:
     """Return whether some effects leave a good part of the gap, to first order: no simulation is made."""
     ws, fit = problem.comparison, problem.fit
     gap = ws.gap(fit.difference)
-    if gap < FREE_FROM * ws.floor():
+    if gap < MANYFOLD * ws.floor():
         return False
     columns = [fit.jacobian[:, j] for j in range(len(fit.free))]
-    for _ in range(FOLLOWED):
+    for _ in range(MANY_EFFECTS):
         known = np.column_stack(columns) if columns else None
         best = max(problem.search.screen.score(fit.residual, known), key=lambda s: s.gain, default=None)
         if best is None:
             break
         columns += problem.search.screen.columns_of(best.candidate)
-    return not columns or _residual_gap(ws, fit, columns) > max(FOLLOWS * gap, FREE_FROM * ws.floor())
+    return not columns or _residual_gap(ws, fit, columns) > max(MINOR * gap, MANYFOLD * ws.floor())
 
 
 def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray], free: Free | None = None) -> float:
@@ -223,7 +212,7 @@ def _rounded_beside_effect(problem: Problem) -> bool:
     """Whether one effect leaves little of the gap beside loads that may be rounded, and much alone, to first order."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     gap = ws.gap(fit.difference)
-    if gap < FREE_FROM * ws.floor():
+    if gap < MANYFOLD * ws.floor():
         return False
     implied = []
     for i, (o, difference) in enumerate(zip(ws.observations, fit.difference, strict=True)):
@@ -233,11 +222,11 @@ def _rounded_beside_effect(problem: Problem) -> bool:
         implied += [p for p in asked.holds if np.any(p.annotated != 0.0)]
     alone = _residual_gap(ws, fit, _best_beside(problem, None))
     # Nothing leaves less than the noise does.
-    if CLOSED * alone <= ws.floor():
+    if PART * alone <= ws.floor():
         return False
     free = ws.with_free((*ws.directions, *directions(ws, implied))).free
     beside = _residual_gap(ws, fit, _best_beside(problem, free), free)
-    return beside < FOLLOWS * gap and beside < CLOSED * alone
+    return beside < MINOR * gap and beside < PART * alone
 
 
 def _best_beside(problem: Problem, free: Free | None) -> list[FloatArray]:
@@ -272,7 +261,7 @@ def _with_all_loads_free(
     of loads in whole steps whatever other loads would leave. ``had``: this search, if it was made before.
     """
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
-    if ws.gap(problem.fit.difference) < FREE_FROM * ws.floor():
+    if ws.gap(problem.fit.difference) < MANYFOLD * ws.floor():
         return None
     wrong, observations = [], []
     for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
@@ -347,9 +336,7 @@ def law(problem: Problem) -> Problem:
     large_gap = ws.gap(fit.difference) > SIGNIFICANT * ws.floor()
     if not (unknown_of(problem.residual, 1.0) or large_gap or coincidences(fit, ws.physics)):
         return problem
-    found_law = find_law(
-        ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.rng, problem.progress
-    )
+    found_law = find_law(ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.progress)
     if found_law is None:
         return problem
     problem = _beside(replace(problem, law=found_law), found_law)

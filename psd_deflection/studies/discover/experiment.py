@@ -20,12 +20,12 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.discover.hidden import only_in
-from psd_deflection.studies.discover.search.fit import STEP, Fit
+from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, fine_means
+from psd_deflection.studies.discover.thresholds import MOST, STEP
+from psd_deflection.studies.loads.plate_motion import fine_means
+from psd_deflection.studies.loads.thresholds import FINE_SECONDS
 
-ROOM = 0.8
-"""Share of the way from an unloaded dot to the edge of its sensor, or of the converter's range, that a load may use."""
 START_CELSIUS = 20.0
 SWINGS = (0.0, 0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)
 """Course of the temperature in a recording in which it swings, over the swing."""
@@ -119,7 +119,7 @@ def pieces(rig: Rig, limits: Limits) -> list[Piece]:
     """What can be done to a link, 8 to 40 s each, with the dots on the sensors."""
     physics = Physics.of(rig)
     edge = np.minimum(physics.half_area, physics.full_scale * physics.sensitivity) - np.abs(rig.zeros)
-    room = ROOM * float(edge.min())
+    room = MOST * float(edge.min())
     reach = float(np.hypot(*rig.centers.T).max())
     f = min(limits.force, room / physics.force_compliance)
     t = min(limits.torque, room / max(physics.torque_compliance * reach, 1e-12))

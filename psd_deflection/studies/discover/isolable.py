@@ -1,7 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
 """Which effects could be told apart, from the rig and planned loads alone: detectable from the size at which a search
-accepts it, identifiable from the size at which the part that no other effect imitates reaches ``SEPARATES``; to first
+accepts it, identifiable from the size at which the part that no other effect imitates reaches ``EQUIVALENT``; to first
 order."""
 
 import math
@@ -23,16 +23,14 @@ from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.discover.planning import SEPARATES
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
+from psd_deflection.studies.discover.search.comparison import EQUIVALENT
 from psd_deflection.studies.discover.search.screen import Candidate, Screen, solve_observable
 from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
+from psd_deflection.studies.discover.thresholds import BIC_GAIN
 from psd_deflection.studies.study import PageSection, StudyResult
 
-ALIKE = 1e-5
-"""sin² below which two signatures are one: what is left of 32-bit signatures is rounding."""
 FROM_READINGS = ('spectral', 'line', 'value_grid', 'value_grid_dots')
 """Proposals that only readings can make."""
 
@@ -201,7 +199,7 @@ def isolable(
 def _accepted(search: Search, parameters: int) -> float:
     """Chi-square from which a search accepts an effect of so many free parameters."""
     by_chance = -math.expm1(math.log1p(-search.workspace.p_accept) / len(search.screen.candidates))
-    return max(float(chi2.isf(by_chance, parameters)), search.penalty * parameters + BIC_ACCEPT)
+    return max(float(chi2.isf(by_chance, parameters)), search.penalty * parameters + BIC_GAIN)
 
 
 def _label(candidate: Candidate) -> str:
@@ -231,7 +229,8 @@ def _isolable(
         if other_choices[0].effect is not candidate.effect and len(other_choices[0].free) <= len(candidate.free)
     ]
     share, alike = max(alternatives, default=(0.0, ''))
-    apart = 1.0 - share if 1.0 - share > ALIKE else 0.0
+    # What is left of two like signatures of 32 bit is rounding.
+    apart = 1.0 - share if 1.0 - share > 100.0 * np.finfo(np.float32).eps else 0.0
     accepted = accepts(len(candidate.free))
     p = candidate.effect.parameter(candidate.free[0])
     out = Isolable(
@@ -239,7 +238,7 @@ def _isolable(
         parameter=p.name,
         unit=p.unit,
         observed=_size(candidate, length, accepted),
-        named=None if apart == 0.0 else _size(candidate, length, max(accepted, SEPARATES / apart)),
+        named=None if apart == 0.0 else _size(candidate, length, max(accepted, EQUIVALENT / apart)),
         alike=alike,
         apart=apart,
     )
@@ -277,5 +276,5 @@ def _of_probes(screen: Screen, effect: Isolable, probes: Sequence[Candidate], ac
         enough = [c for c in probes if lengths[c] >= wanted]
         return min(enough, key=lambda c: lengths[c]).start[p.name] if enough else None
 
-    named = None if effect.apart == 0.0 else weakest(max(accepted, SEPARATES / effect.apart))
+    named = None if effect.apart == 0.0 else weakest(max(accepted, EQUIVALENT / effect.apart))
     return replace(effect, observed=weakest(accepted), named=named)

@@ -22,7 +22,9 @@ from psd_deflection.records import FloatArray, IntArray, channel_names, dot_name
 from psd_deflection.studies.discover.hidden import only_in
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import BIC_GAIN, LEVELS, MANY_EFFECTS, MAX_FINE, TRIED
 from psd_deflection.studies.loads.plate_motion import fine_means
+from psd_deflection.studies.loads.thresholds import MANYFOLD
 
 LOADS, POSE = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta')
 
@@ -35,9 +37,6 @@ def sought(psds: int) -> tuple[str, ...]:
 
 SOUGHT = sought(2)
 """Those of two PSDs."""
-_BATCH = 64
-LEVELS = 24
-"""Thresholds that are tried of a form that jumps there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,8 +260,9 @@ def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targe
     targets, count, k = targets or every, len(every), responses_of_rig[0].weight.shape[1] // len(every)
     listed = [t for t in listed if any(allowed(name, t) for name in targets)]
     ways = sorted({_way(name) for name in targets})
-    for start in range(0, len(listed), _BATCH):
-        batch = listed[start : start + _BATCH]
+    size = max(1, round(MANYFOLD * MAX_FINE) // len(responses_of_rig[0].error[0]))
+    for start in range(0, len(listed), size):
+        batch = listed[start : start + size]
         # In place, and through the modes of bending and torsion.
         totals = np.zeros((3, len(batch), count, k))
         lengths = np.zeros((3, len(batch), count))
@@ -289,13 +289,6 @@ def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targe
     return out
 
 
-MOST_TIMES = 12
-REFINED = 4
-"""Of the terms with times, so many get better times."""
-TOGGLE_COST = 24.0
-"""Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
-
-
 def switchings(responses_of_rig: Sequence[Response], targets: Sequence[str] = ()) -> list[LawTerm]:
     """Terms that are on between times which the residual of the only recording shows, on ``targets``, by default all.
 
@@ -313,12 +306,12 @@ def switchings(responses_of_rig: Sequence[Response], targets: Sequence[str] = ()
             v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
             error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
             times = two_levels(error, r.power[t] * v * v, v)
-            if 0 < len(times) <= MOST_TIMES:
+            if 0 < len(times) <= TRIED:
                 term = LawTerm('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
                 places = (name, f'static_{name}') if on_link else (name,)
                 scored += score(responses_of_rig, [term], places)
     scored.sort(key=lambda s: -s.gain)
-    better = [with_better_times(responses_of_rig, s.target, s.term) for s in scored[:REFINED]]
+    better = [with_better_times(responses_of_rig, s.target, s.term) for s in scored[:MANY_EFFECTS]]
     return list({(t.of, t.times): t for t in better}.values())
 
 
@@ -380,7 +373,7 @@ def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int
     top, below = p[None, :] - p[:, None], n[None, :] - n[:, None]
     gain = np.where(below > 1e-9 * n[-1], top**2 / np.maximum(below, 1e-9 * n[-1] + 1e-300), 0.0)
     a, b = np.unravel_index(int(np.argmax(np.triu(gain, 1))), gain.shape)
-    if below[a, b] <= 0.0 or gain[a, b] < TOGGLE_COST:
+    if below[a, b] <= 0.0 or gain[a, b] < toggle_cost(len(ratio)):
         return []
     level = float(top[a, b] / below[a, b])
     for _ in range(4):
@@ -392,12 +385,18 @@ def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int
     return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
 
 
+def toggle_cost(blocks: int) -> float:
+    """Return the chi-square that each switching must gain: any of the ``blocks`` might have been its time."""
+    return 2.0 * math.log(blocks) + BIC_GAIN
+
+
 def likeliest_states(gain: FloatArray) -> IntArray:
-    """States (n,) 0 or 1 that gain most, each change for ``TOGGLE_COST``; 0 before the first."""
-    off, on = 0.0, -TOGGLE_COST
+    """States (n,) 0 or 1 that gain most, each change for :func:`toggle_cost`; 0 before the first."""
+    cost = toggle_cost(len(gain))
+    off, on = 0.0, -cost
     came = np.empty((len(gain), 2), dtype=np.int64)
     for k, g in enumerate(gain.tolist()):
-        from_on, from_off = on - TOGGLE_COST, off - TOGGLE_COST
+        from_on, from_off = on - cost, off - cost
         came[k, 0], came[k, 1] = int(from_on > off), int(on >= from_off)
         off, on = max(off, from_on), max(on, from_off) + g
     state = np.empty(len(gain), dtype=np.int64)

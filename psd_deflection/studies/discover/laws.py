@@ -31,35 +31,20 @@ from psd_deflection.studies.discover.law_features import (
     with_better_level,
     with_better_times,
 )
+from psd_deflection.studies.discover.search.comparison import EQUIVALENT
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut, heldout_gain, heldout_gap, refit
-from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
 from psd_deflection.studies.discover.search.workspace import Workspace
-
-P_ACCEPT = 0.01
-"""Largest p, over all that might have been taken, of a law."""
-TRIED = 12
-"""Terms that are refitted in the simulation for the first place."""
-FOLLOWED = 3
-"""Of these, the best are refitted in full and get further terms."""
-MAX_TERMS = 4
-BUDGET = 600
-"""Forward simulations beside one set of effects after which no term is added."""
-ALTOGETHER = 1800
-"""Forward simulations of the whole search after which none is."""
-TIED = 21.6
-"""Loss in chi-square below which another law counts as equivalent, as for effects."""
-UNDETERMINED = 100.0
-"""Standard deviation, over its value, from which on a number counts as not determined."""
-EXPLAINS = 0.5
-"""Share of what is left that a law must explain: in chi-square, and on unseen load cases."""
-MANY_TIMES, NEAR_S = 3, 0.3
-"""So many times of switching, most of them so near to changes of the load, s, are the loads'."""
-NOTABLE = 1.1
-"""A gap of more floors asks for something that makes it: noise that follows a variable must make half of it."""
-MOVES = 3.0
-"""Means of blocks that differ by more floors than this are no noise."""
-WRITTEN = 2.0
-"""A law that leaves more floors than this on unseen load cases is reported, but is no model: it is not written."""
+from psd_deflection.studies.discover.thresholds import (
+    BIC_GAIN,
+    BUDGET,
+    HALF,
+    LIKELY,
+    MANY_EFFECTS,
+    P_CHANCE,
+    ROUNDS,
+    TRIED,
+)
+from psd_deflection.studies.loads.thresholds import APART_S, DISTINCT_SD, MANYFOLD, MINOR, SEVERAL
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +132,7 @@ def fitted_law(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
         sizes = {'coefficient': values[f'c{i}'], **shapes}
         # What the recording does not determine has no standard deviation.
         deviations = {
-            k: v for k, v in deviations.items() if v < UNDETERMINED * abs(sizes[k]) and k not in FORMS[t.form].fixed
+            k: v for k, v in deviations.items() if v < MANYFOLD**2 * abs(sizes[k]) and k not in FORMS[t.form].fixed
         }
         deviations.update({k: t.sd[k] for k in FORMS[t.form].fixed if k in t.sd})
         out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=deviations))
@@ -159,7 +144,7 @@ class LawSearch:
 
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
         self.ws, self.start, self.penalty = ws, start, penalty
-        self.last = min(ws.simulations + BUDGET, max(ws.simulations, ALTOGETHER))
+        self.last = min(ws.simulations + BUDGET, max(ws.simulations, ROUNDS * BUDGET))
         self.responses = responses(ws, start)
         self.listed = list(terms(self.responses))
         if len(ws.observations) == 1:
@@ -199,34 +184,34 @@ class LawSearch:
         picked: list[Scored] = []
         for s in scored:
             key = (s.target, s.term.form, s.term.of)
-            if key not in known and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
+            if key not in known and s.gain >= LIKELY * scored[0].gain and len(picked) < TRIED:
                 known.add(key)
                 picked.append(with_better_level(self.responses, s))
         quick = [self.trial([law_on(s.target, s.term)], self.start.effects, 3) for s in picked]
         quick.sort(key=lambda t: t.cost)
-        full = [self.trial(t.laws, t.beside, 8) for t in quick[:FOLLOWED]]
-        return sorted([*full, *quick[FOLLOWED:]], key=lambda t: t.cost)
+        full = [self.trial(t.laws, t.beside, 8) for t in quick[:ROUNDS]]
+        return sorted([*full, *quick[ROUNDS:]], key=lambda t: t.cost)
 
     def grown(self, trial: LawTrial) -> LawTrial:
         """Further terms while BIC improves by enough; then terms that it does not miss go."""
-        while trial.terms < MAX_TERMS and not self.done(trial):
+        while trial.terms < MANY_EFFECTS and not self.done(trial):
             more = responses(self.ws, trial.fit)
             if trial.laws[0].terms[0].times and len(trial.laws) == 1:
                 again = self._switched_again(trial, more)
-                if again.cost < trial.cost - BIC_ACCEPT:
+                if again.cost < trial.cost - BIC_GAIN:
                     trial = again
                     continue
             scored = score(more, [t for t in self.listed if t.form != 'switched'])
             better = [with_better_level(more, s) for s in scored[:2]]
             tries = [self.trial(with_term(trial.laws, s), trial.beside, 4) for s in better]
             best = min(tries, key=lambda t: t.cost, default=trial)
-            if best.cost > trial.cost - BIC_ACCEPT:
+            if best.cost > trial.cost - BIC_GAIN:
                 break
             trial = best
         while trial.terms > 1:
             fewer = [self.trial(laws, trial.beside, 5) for laws in subsets_without_a_term(trial.laws)]
             best = min(fewer, key=lambda t: t.cost)
-            if best.cost > trial.cost + BIC_ACCEPT:
+            if best.cost > trial.cost + BIC_GAIN:
                 break
             trial = best
         return trial
@@ -249,7 +234,7 @@ class LawSearch:
         while trial.beside:
             fewer = [self.trial(trial.laws, [a for a in trial.beside if a is not gone], 5) for gone in trial.beside]
             best = min(fewer, key=lambda t: t.cost)
-            if best.cost > trial.cost + BIC_ACCEPT:
+            if best.cost > trial.cost + BIC_GAIN:
                 break
             trial = best
         return trial
@@ -297,7 +282,6 @@ def find_law(
     fit: Fit,
     penalty: float,
     excess: float,
-    rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> FoundLaw | None:
     """Return the law that explains what ``fit`` leaves, or None.
@@ -306,13 +290,11 @@ def find_law(
     ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
     """
     progress('a law for what remains')
-    found_law = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
+    found_law = _law_of_the_mean(ws, null, fit, penalty, excess)
     return found_law or find_jitter(ws, fit, penalty)
 
 
-def _law_of_the_mean(
-    ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, rng: np.random.Generator
-) -> FoundLaw | None:
+def _law_of_the_mean(ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float) -> FoundLaw | None:
     starts = [fit, null] if fit.effects else [null]
     trials: list[tuple[LawTrial, LawSearch]] = []
     for start in starts:
@@ -324,7 +306,7 @@ def _law_of_the_mean(
     trials.sort(key=lambda t: t[0].cost)
     # Where one law leaves nothing but noise, others get no further terms.
     followed: list[tuple[LawTrial, LawSearch]] = []
-    for t, s in trials[:FOLLOWED]:
+    for t, s in trials[:ROUNDS]:
         followed.append((t if s.done(t) else s.grown(t), s))
         if s.done(followed[-1][0]):
             break
@@ -341,14 +323,14 @@ def _law_of_the_mean(
     chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / (3.0 * ws.psds), 2.0))
     p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
     bic = gain - (best.cost - fit_with_law.chi2 - penalty * without.parameters)
-    held = heldout_gain(ws, without, fit_with_law, rng)
+    held = heldout_gain(ws, without, fit_with_law)
     residual_gap = heldout_gap(ws, fit_with_law)
     # As of effects: no other case can speak for or against what one case alone shows.
     predicts = _predicts(ws, fit, heldout_gap(ws, fit_with_law, home=False))
-    enough = predicts and fit.chi2 - fit_with_law.chi2 > EXPLAINS * excess
+    enough = predicts and fit.chi2 - fit_with_law.chi2 > HALF * excess
     enough &= not _at_changes(ws, best.laws)
-    enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
-    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.significant or not enough:
+    enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_GAIN
+    if p > P_CHANCE or bic <= BIC_GAIN or not held.significant or not enough:
         return None
     return FoundLaw(
         best.laws[0],
@@ -369,7 +351,7 @@ def _predicts(ws: Workspace, fit: Fit, residual_gap: float) -> bool:
     beyond noise.
     """
     floor = ws.floor()
-    return residual_gap**2 - floor**2 <= (1.0 - EXPLAINS) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
+    return residual_gap**2 - floor**2 <= (1.0 - HALF) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
 
 
 def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
@@ -377,9 +359,9 @@ def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
     times = np.array([t for law in laws for term in law.terms for t in term.times])
     (o, *more) = ws.observations
     changes = np.flatnonzero(np.any(np.diff(o.loads, axis=0) != 0.0, axis=1)) * o.period
-    if len(times) < MANY_TIMES or more or len(changes) == 0 or len(changes) > o.duration:
+    if len(times) < SEVERAL or more or len(changes) == 0 or len(changes) > o.duration:
         return False
-    at_change = np.abs(times[:, None] - changes).min(axis=1) < NEAR_S
+    at_change = np.abs(times[:, None] - changes).min(axis=1) < APART_S
     return bool(np.mean(at_change) > 0.5)
 
 
@@ -403,10 +385,10 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         held.append(likelihood(squares[held_out], a + b * v2[held_out]) - likelihood(squares[held_out], flat))
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
     p = tried * float(chi2_law.sf(gain, 1))
-    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.significant or slope <= 0.0:
+    if p > P_CHANCE or gain - penalty <= BIC_GAIN or not heldout.significant or slope <= 0.0:
         return None
     # Noise that grows with the motion explains no gap: what remains in means is a movement.
-    if ws.gap(fit.difference) > MOVES * ws.floor():
+    if ws.gap(fit.difference) > DISTINCT_SD * ws.floor():
         return None
     scale = float(np.mean([n.innovation[c] * math.sqrt(s) for n, s in zip(ws.noise, ws.fine, strict=True)]))
     if not channel.startswith('sum'):
@@ -420,7 +402,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     added /= float(len(ws.channels)) * ws.observations[0].rig.estimator.block_size
     added = 0.0 if channel.startswith('sum') else added
     more = ws.gap(fit.difference) ** 2 - ws.floor() ** 2
-    if ws.gap(fit.difference) > NOTABLE * ws.floor() and added < EXPLAINS * more:
+    if ws.gap(fit.difference) > (1.0 + MINOR) * ws.floor() and added < HALF * more:
         return None
     with_jitter = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
     alternatives = [dataclasses.replace(law, stage='psd')]
@@ -447,8 +429,8 @@ def simplest(best: LawTrial, alternatives: Sequence[LawTrial]) -> LawTrial:
     tied = [
         t
         for t in (best, *alternatives)
-        if t.fit.chi2 - best.fit.chi2 < TIED
-        and t.cost - best.cost < BIC_ACCEPT
+        if t.fit.chi2 - best.fit.chi2 < EQUIVALENT
+        and t.cost - best.cost < BIC_GAIN
         and [a.effect.name for a in t.beside] == beside
     ]
 
@@ -467,7 +449,7 @@ def tied_laws(best: LawTrial, alternatives: Sequence[LawTrial]) -> tuple[Law, ..
 
     out = {key(best.laws[0]): best.laws[0]}
     for t in sorted(alternatives, key=lambda t: t.cost):
-        if t.fit.chi2 - best.fit.chi2 < TIED and t.cost - best.cost < TIED:
+        if t.fit.chi2 - best.fit.chi2 < EQUIVALENT and t.cost - best.cost < EQUIVALENT:
             out.setdefault(key(t.laws[0]), t.laws[0])
     return tuple(out.values())[1:]
 

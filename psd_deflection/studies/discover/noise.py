@@ -19,23 +19,8 @@ from scipy.signal import detrend, lfilter
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig
-
-CLIP = 6.0
-"""Whitened values are limited to this: an outlier is no slow noise."""
-HIGHEST_HZ = 20.0
-"""Up to which the density is looked at."""
-CORNERS = np.geomspace(0.02, 200.0, 120)
-"""Hz: those that are tried."""
-CLEAR = 0.5
-"""Log-likelihood that a corner must gain on all sums together. A small corner that is none costs little; one that is
-not seen makes a drift of noise.
-"""
-WIDER = 1.3
-"""How much larger than those of the lights, and than the second smallest of the dots, a channel's corner may be."""
-APART = 4.0
-"""How much larger than the smallest of the other lights the corner of one may be."""
-LEAST_VALUES = 64
-"""Of a recording and channel."""
+from psd_deflection.studies.discover.thresholds import BANDS, CERTAIN_SD, CORNERS, LEAST_REST, ORDER, SIGNIFICANT
+from psd_deflection.studies.loads.thresholds import AS_GOOD, DISTINCT_SD, MANYFOLD, PART, SAME
 
 
 def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
@@ -49,23 +34,24 @@ def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatAr
     light = gains[2::3]
     corners = np.where(gains.max(axis=1) > 0.0, CORNERS[np.argmax(gains, axis=1)], 0.0)
     dots = np.sort(corners[list(dot_channels(channels // 3))])
-    # What moves some of the dots (three of four), or one light, alone is more than this noise.
-    if light.sum(axis=0).max() < CLEAR or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
+    # What moves some of the dots (three of four), or one light, alone is more than this noise. One more parameter gains
+    # 1 in chi-square by chance; the corner goes with the square of an amplitude.
+    if 2.0 * light.sum(axis=0).max() < 1.0 or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
         return np.zeros(channels)
     low, high = corners[2::3].min(), corners[2::3].max()
-    return np.asarray(np.minimum(corners, WIDER * min(high, APART * low, dots[1])))
+    return np.asarray(np.minimum(corners, SIGNIFICANT * min(high, AS_GOOD**2 * low, dots[1])))
 
 
 def _gains(rows: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
     """Return the log-likelihood that each of ``CORNERS`` gains over white noise, of one channel (P. Whittle, 1953)."""
     gains = np.zeros(len(CORNERS))
     for row, period in zip(rows, periods, strict=True):
-        values = np.clip(row, -CLIP, CLIP)
+        values = np.clip(row, -CERTAIN_SD, CERTAIN_SD)
         count = int(np.count_nonzero(values))
-        if count < LEAST_VALUES:
+        if count < LEAST_REST:
             continue
         f = np.fft.rfftfreq(len(row), period)
-        low = (f > 0.0) & (f <= HIGHEST_HZ)
+        low = (f > 0.0) & (f <= BANDS[4])
         power = np.abs(np.fft.rfft(values)[low]) ** 2 / count
         density = 1.0 + CORNERS[:, None] / f[low]
         gains += (power * (1.0 - 1.0 / density) - np.log(density)).sum(axis=1)
@@ -113,19 +99,6 @@ def block_factor(seconds: float, block: float, corners: FloatArray) -> FloatArra
 
 
 BoolArray = npt.NDArray[np.bool_]
-
-ORDER = 2
-SIGNIFICANT = 5.0
-"""Lag-1 correlation, in its standard errors, from which the noise is taken as coloured."""
-LIKE_MOST = 2.0
-"""The same, if that of most channels is: their amplifiers are alike."""
-LEAST_REST = 400
-"""More samples at rest than this tell a memory."""
-MOVING = 10.0
-"""Coloured noise is at most so many times what neighbouring samples show; beyond, what is taken for rest moves."""
-
-ALIKE = 0.2
-"""Share by which corners of slow noise may differ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,8 +163,8 @@ class NoiseModel:
         """Return whether a search need not tell it from ``other``."""
         return (
             self.coloured == other.coloured
-            and np.allclose(self.innovation, other.innovation, rtol=0.02)
-            and np.allclose(self.corners, other.corners, rtol=ALIKE, atol=0.0)
+            and np.allclose(self.innovation, other.innovation, rtol=SAME)
+            and np.allclose(self.corners, other.corners, rtol=PART, atol=0.0)
         )
 
     def of_slow_change(self, white: FloatArray) -> FloatArray:
@@ -317,9 +290,9 @@ def _memories(residual: FloatArray, rest: list[slice], floors: FloatArray) -> li
             pooled[c] = [_product(rows, k) / max(_product(valid, k), 1.0) for k in range(ORDER + 1)]
             if pooled[c, 0] > floor**2:
                 significant[c] = abs(pooled[c, 1]) / pooled[c, 0] * np.sqrt(count)
-    most = 2 * int(np.sum(significant > SIGNIFICANT)) > len(significant)
+    most = 2 * int(np.sum(significant > CERTAIN_SD)) > len(significant)
     return [
-        row if s > (LIKE_MOST if most else SIGNIFICANT) else None for row, s in zip(pooled, significant, strict=True)
+        row if s > (DISTINCT_SD if most else CERTAIN_SD) else None for row, s in zip(pooled, significant, strict=True)
     ]
 
 
@@ -354,7 +327,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
             scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
             density = scale * _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
             with_memory = np.real(np.fft.ifft(density))[: len(acov)]
-            memory = not with_memory[0] > (MOVING * max(_between_neighbours(residual[:, c]), floor)) ** 2
+            memory = not with_memory[0] > (MANYFOLD * max(_between_neighbours(residual[:, c]), floor)) ** 2
             acov, sample_ar[c] = (with_memory, phi) if memory else (acov, 0.0)
         coloured.append(bool(memory))
         sigma[c] = np.sqrt(acov[0])

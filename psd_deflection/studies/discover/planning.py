@@ -25,22 +25,16 @@ from psd_deflection.studies.discover.experiment import (
     nothing_of,
     proposals,
 )
+from psd_deflection.studies.discover.search.comparison import EQUIVALENT
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-
-SEPARATES = 21.6
-"""lambda sin^2(theta) from which two effects are distinguished: lambda sin^2(theta/2) >= 5.4, small angles."""
-SURE = 60.0
-"""Expected chi-square beyond which more is worth nothing: its scatter of 2 sqrt(60) leaves ``SEPARATES``."""
-WORTH = 0.02
-"""Least value that a further piece must add."""
-EFFORT_OF_A_MINUTE = 0.03
-"""Value that a minute of recording must add to be worth its time."""
+from psd_deflection.studies.discover.thresholds import SURE
+from psd_deflection.studies.loads.thresholds import SAME
 
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """``separation``: smallest chi-square between the alternatives; below ``SEPARATES`` the experiment is not
+    """``separation``: smallest chi-square between the alternatives; below ``EQUIVALENT`` the experiment is not
     enough.
     """
 
@@ -50,10 +44,10 @@ class Suggestion:
     @property
     def text(self) -> str:
         """The suggestion as text, for people and result.json."""
-        if self.separation < SEPARATES:
+        if self.separation < EQUIVALENT:
             return (
                 f'none of the experiments tried tells them apart; the best, {self.words}, separates them by '
-                f'{math.sqrt(self.separation):.1f} standard deviations (needed: {math.sqrt(SEPARATES):.1f})'
+                f'{math.sqrt(self.separation):.1f} standard deviations (needed: {math.sqrt(EQUIVALENT):.1f})'
             )
         apart = f'{math.sqrt(self.separation):.2g}'
         return f'{self.words}: in simulation this separates them by {float(apart):g} standard deviations'
@@ -75,7 +69,7 @@ class Discrimination:
     @property
     def separable(self) -> bool:
         """Whether any recording within the limits tells the two apart."""
-        return self.possible >= SEPARATES
+        return self.possible >= EQUIVALENT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +123,7 @@ class Plan:
         separable = ', '.join(dict.fromkeys(t.alternative for t in apart))
         out = (
             f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {separable} '
-            f'(chi-square {least:.0f} at least, {SEPARATES:g} needed)'
+            f'(chi-square {least:.0f} at least, {EQUIVALENT:g} needed)'
         )
         lasting = [t.alternative for t in self.discriminations if not t.separable]
         return f'{out}; nothing within the limits tells {", ".join(lasting)} apart.' if lasting else f'{out}.'
@@ -273,12 +267,12 @@ def best_combination(
             more = total + s
             if more.seconds <= seconds + 1e-6:
                 worth = float(np.mean(np.minimum(separations(more) / SURE, 1.0)))
-                trials.append((worth - EFFORT_OF_A_MINUTE * more.seconds / 60.0, len(trials), piece, more))
+                trials.append((worth - SAME * more.seconds / 60.0, len(trials), piece, more))
         if not trials:
             return value, chosen
         best, _, piece, more = max(trials, key=lambda t: t[:2])
         # One piece is there in any case: to say what it would be like.
-        if chosen and best < value + WORTH:
+        if chosen and best < value + SAME:
             return value, chosen
         value, total = best, more
         chosen.append(piece)

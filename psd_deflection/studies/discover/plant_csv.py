@@ -17,14 +17,13 @@ from psd_deflection.base.csv_table import CsvTable
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import EffectParameter
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.studies.discover.plants import FOLDS, Model, Plant, plant_effect
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.thresholds import FOLDS, RANGE
 
 KINDS = ('number', 'degrees', 'radians', 'sign')
 """Of an input: terms of its powers, of sine and cosine, or of its sign beside its powers."""
 
 _UNIT = re.compile(r'[\[(]([^\])]*)[\])]\s*$')
-_REACH = 20.0
-"""Largest size of a term, in standard deviations of the output."""
 
 
 class _Term(NamedTuple):
@@ -93,7 +92,7 @@ class CsvPlant(Plant):
                 scale = of_output / float(np.sqrt(np.mean(term.values**2)) + 1e-300)
                 full_unit = f'{unit or 1}/{term.unit}' if term.unit else unit
                 words = f'{name} in {output}'
-                parameter = EffectParameter('size', full_unit, -_REACH * scale, _REACH * scale, scale, words)
+                parameter = EffectParameter('size', full_unit, -RANGE[1] * scale, RANGE[1] * scale, scale, words)
                 effects[f'{output}: {name}'] = parameter
         self.library = tuple(plant_effect(n, p) for n, p in effects.items() if not n.endswith(': offset'))
         self.nuisance = tuple(plant_effect(n, p) for n, p in effects.items() if n.endswith(': offset'))

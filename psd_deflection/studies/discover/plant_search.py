@@ -33,17 +33,11 @@ from psd_deflection.studies.discover.search.localise import Cell, Localisation, 
 from psd_deflection.studies.discover.search.predictive import as_model
 from psd_deflection.studies.discover.search.screen import Screen, candidates, signatures_beside
 from psd_deflection.studies.discover.search.smooth import Smooth, Table, smooth_of
-from psd_deflection.studies.discover.search.weighing import SIGNIFICANT, sd_of
+from psd_deflection.studies.discover.search.weighing import sd_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, search, solve, weigh, where
+from psd_deflection.studies.discover.thresholds import LEAST_LEVEL, P_CHANCE, PLANT_BUDGET, SIGNIFICANT
+from psd_deflection.studies.loads.thresholds import PART, SAME
 from psd_deflection.studies.study import PageSection
-
-BUDGET = 4000
-ROUNDING, TINY = 1e-9, 1e-100
-"""Least level of what remains: of the largest reading of a channel, and at all."""
-ALIKE = 0.2
-"""Independent values, as a share of all: of noise it is hardly less."""
-SAME = 0.02
-"""Relative change of the level up to which it counts as the same."""
 
 
 def _exact(plant: Plant, measured: Sequence[FloatArray], nuisance: Sequence[ActiveEffect]) -> npt.NDArray[np.bool_]:
@@ -65,10 +59,10 @@ class PlantComparison(Comparison):
     """A plant's cases, measured and simulated. Raises ConfigError if its tables do not fit each other."""
 
     open_level = True
-    budget = BUDGET
+    budget = PLANT_BUDGET
     most_budgets = math.inf
     # Its values are few, and one machine is asked once.
-    p_accept = 0.01
+    p_accept = P_CHANCE
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -155,7 +149,8 @@ class PlantComparison(Comparison):
         # What is left of an exact simulation is rounding: no level is below that.
         tables = np.concatenate([np.nan_to_num(m) for m in self.measured], axis=1)
         size = np.abs(tables).max(axis=1, initial=0.0)
-        level = np.maximum(np.maximum(level, self.known), np.maximum(ROUNDING * size, TINY))
+        tiny = math.sqrt(np.finfo(np.float64).tiny)
+        level = np.maximum(np.maximum(level, self.known), np.maximum(LEAST_LEVEL * size, tiny))
         independent = np.array([self._independent(difference, c) for c in range(len(self.channels))])
         return level, independent
 
@@ -171,7 +166,7 @@ class PlantComparison(Comparison):
 
     def _alike(self, independent: FloatArray) -> bool:
         """Return whether what remains is alike from one value to the next, and no noise is stated."""
-        return not self.plant.noise and float(independent.sum()) < ALIKE * float(self.total.sum())
+        return not self.plant.noise and float(independent.sum()) < PART * float(self.total.sum())
 
     def _independent(self, difference: Sequence[FloatArray], channel: int) -> float:
         """Values over the integrated correlation time, which ends at its first zero."""
@@ -409,7 +404,7 @@ def localise_cases(ws: PlantComparison, fit: Fit, known: FloatArray | None) -> L
             z = (np.cbrt(energy / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
             p = float(-np.expm1(tried * np.log1p(-min(float(chi2_law.sf(energy, dof)), 1.0 - 1e-16))))
             shown[i, c, 0] = z
-            names = tuple(d.regressor for d in depends if d.channel == channel and d.p < 0.01)[:2]
+            names = tuple(d.regressor for d in depends if d.channel == channel and d.p < P_CHANCE)[:2]
             period = ws.plant.period
             end = part.shape[1] * period if period > 0.0 else 0.0
             band = (0.0, 0.5 / period if period > 0.0 else 0.0)

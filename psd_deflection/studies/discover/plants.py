@@ -28,11 +28,10 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.conclusion import model_yaml
 from psd_deflection.studies.discover.noise import settling
 from psd_deflection.studies.discover.search.fit import BoolArray
+from psd_deflection.studies.discover.thresholds import CERTAIN_SD, FEWEST_CASES, FOLDS, HALF
 from psd_deflection.studies.loads.plate_motion import dots_of
+from psd_deflection.studies.loads.thresholds import FEWEST_LOADS, SEVERAL
 from psd_deflection.studies.study import Notify, warn_caller
-
-FOLDS = 4
-"""Parts that are left out in turn, at least; few cases are cut into pieces."""
 
 Model = Mapping[str, Values]
 """Name of an effect to the values of its parameters."""
@@ -169,9 +168,6 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {
 """Of two PSDs."""
 OF_POSE = ('µm', 'µm', 'µrad')
 MICRO = 1e6
-LEAST_LOADS = 4
-TABLE_FOLDS = 6
-"""Parts into which the loads are dealt in turn; each is left out of the fit once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,8 +189,8 @@ class Readings:
 
     def __post_init__(self) -> None:
         count = len(self.distinct)
-        if count < LEAST_LOADS:
-            raise RecordingError(f'{self.name}: {count} different loads: discover needs at least {LEAST_LOADS}')
+        if count < FEWEST_LOADS:
+            raise RecordingError(f'{self.name}: {count} different loads: discover needs at least {FEWEST_LOADS}')
 
     @property
     def distinct(self) -> FloatArray:
@@ -277,7 +273,7 @@ class ReadingsPlant(Plant):
         out = []
         for t in self.tables:
             _, index = np.unique(t.loads, axis=0, return_inverse=True)
-            out.append(np.asarray(index.ravel() % min(TABLE_FOLDS, len(t.distinct)), dtype=np.int64))
+            out.append(np.asarray(index.ravel() % min(FEWEST_CASES, len(t.distinct)), dtype=np.int64))
         return out
 
     def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
@@ -336,14 +332,6 @@ def fixed_choice(p: EffectParameter) -> EffectParameter:
     if p.kind != 'choice' or p.each:
         return p
     return dataclasses.replace(p, choices=(int(p.nominal) if p.nominal in p.choices else p.choices[0],))
-
-
-FEWEST = 3
-"""References of a row."""
-FAR = 5.0
-"""Standard deviations of most references under one load: what is further off is not under it."""
-MOST_OF_IT = 0.5
-"""Share of the time under one load that is waited for the link to come to rest, at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -412,21 +400,21 @@ def _rows(
     for load, start, stop in zip(changed, starts, stops, strict=True):
         end = min(stop, float(t[-1]))
         applied = there & (t >= start) & (t < stop)
-        if np.count_nonzero(applied) < FEWEST:
+        if np.count_nonzero(applied) < SEVERAL:
             continue
         settled_samples = (
-            applied & _near(poses, applied) & (t >= start + min(settling(rig), MOST_OF_IT * max(end - start, 0.0)))
+            applied & _near(poses, applied) & (t >= start + min(settling(rig), HALF * max(end - start, 0.0)))
         )
-        if np.count_nonzero(settled_samples) >= FEWEST:
+        if np.count_nonzero(settled_samples) >= SEVERAL:
             of.append(load)
             means.append(np.median(poses[settled_samples], axis=0))
             celsius.append(math.nan if warm is None else float(warm[settled_samples].mean()))
     if not of:
-        raise RecordingError(f'{name}: no load hung for as long as {FEWEST} references')
+        raise RecordingError(f'{name}: no load hung for as long as {SEVERAL} references')
     return Resting(np.array(of), np.array(means), None if warm is None else np.array(celsius))
 
 
 def _near(poses: FloatArray, applied: BoolArray) -> BoolArray:
     """(n,): whether ``poses`` (n, 3) are about as near to the median of those that ``applied`` as most of them."""
     off = np.abs(poses - np.median(poses[applied], axis=0))
-    return np.asarray((off <= FAR * 1.4826 * np.median(off[applied], axis=0)).all(axis=1))
+    return np.asarray((off <= CERTAIN_SD * 1.4826 * np.median(off[applied], axis=0)).all(axis=1))

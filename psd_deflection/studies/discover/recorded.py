@@ -30,6 +30,7 @@ from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import correct_wiring, likely_delays
+from psd_deflection.studies.discover.thresholds import HALF, LEVELS
 from psd_deflection.studies.loads.alignment import SKEW, LatePsd, aligned
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads
 from psd_deflection.studies.loads.effective import (
@@ -41,13 +42,7 @@ from psd_deflection.studies.loads.effective import (
     without_times,
 )
 from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, WrongNote, as_applied, wrong_notes_against
-
-MUCH = 10.0
-"""A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
-MOST_AN_EFFECT_DOES = 0.45
-"""Share by which an effect may change a load."""
-MOST_MEASURED = 40
-"""Measured loads of a recording whose errors are considered; each takes three simulations."""
+from psd_deflection.studies.loads.thresholds import MANYFOLD
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,7 +207,7 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
     recorded = replace(recorded, delays=tuple(delays))
     recorded, workspace = _corrected(recorded, workspace)
     residual, difference = workspace.residual(workspace.base)
-    if workspace.gap(difference) > MUCH * workspace.floor():
+    if workspace.gap(difference) > MANYFOLD * workspace.floor():
         # Poses that are far off bend what no movement makes.
         residual = solved(workspace, difference)
     recorded = replace(recorded, fourth=fourth_reading(workspace, residual))
@@ -225,7 +220,7 @@ def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Work
     """
     _, difference = workspace.residual(workspace.base)
     gap = workspace.gap(difference)
-    if gap <= MUCH * min(workspace.floor(), _stated_floor(workspace)):
+    if gap <= MANYFOLD * min(workspace.floor(), _stated_floor(workspace)):
         return recorded, with_free(recorded, workspace)
     notes = [_wrong_notes(workspace, i, part) for i, part in enumerate(difference)]
     if not any(notes):
@@ -272,7 +267,7 @@ def _wrong_notes(
     """What of recording ``i`` was noted otherwise than it hung; ``difference`` (3P, m), V: measured minus simulated."""
     o = workspace.observations[i]
     implied = levels(workspace, i, difference, times(o, i))
-    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), MOST_AN_EFFECT_DOES)
+    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), HALF)
     if not wrong and (unannotated := unannotated_times(implied, len(o.loads), o.period)):
         return [*unannotated]
     return [*swayed(workspace, i, difference, implied), *wrong]
@@ -319,7 +314,7 @@ def with_free(recorded: Recorded, workspace: Workspace) -> Workspace:
             free += in_time(o, i, note)
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(corrected.loads).max(axis=0), 1e-30)
-        if len(corrected.measured) <= MOST_MEASURED:
+        if len(corrected.measured) <= LEVELS:
             free += [d for m in corrected.measured for d in of_hold(o, i, m, m.sd * unit)]
     workspace = workspace.with_free(free)
     # What a large load bends is no change in proportion.

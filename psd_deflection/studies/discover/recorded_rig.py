@@ -19,7 +19,7 @@ from psd_deflection.studies.discover.hidden import FIRST, SETUP, mistakes
 from psd_deflection.studies.discover.planning import Suggestion, suggest
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress
 from psd_deflection.studies.discover.recorded import Recorded
-from psd_deflection.studies.discover.redundant import PART, STAGES, excess, fourth_reading, visible
+from psd_deflection.studies.discover.redundant import STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
@@ -33,9 +33,10 @@ from psd_deflection.studies.discover.search.screen import (
     signatures_beside,
 )
 from psd_deflection.studies.discover.search.smooth import Table
-from psd_deflection.studies.discover.search.trials import FAR, is_far_off
+from psd_deflection.studies.discover.search.trials import is_far_off
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import likely_jumps
+from psd_deflection.studies.loads.thresholds import MANYFOLD, PART
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +119,7 @@ class RecordedRig(Machine):
         """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
         reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
         excess_chi_square, throughout = excess(ws, residual)
-        if reading is None or not reading.acquits or throughout < FAR - 1.0:
+        if reading is None or not reading.acquits or throughout < MANYFOLD - 1.0:
             return signatures
         least = 2.0 * reading.allowed / (PART * excess_chi_square)
         # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.

@@ -14,16 +14,10 @@ from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.screen import Columns
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import CERTAIN_SD
 from psd_deflection.studies.loads.plate_motion import across_of, dot_rows, moved_plate
+from psd_deflection.studies.loads.thresholds import SAME
 
-CLIP = 6.0
-"""Outliers of heavy-tailed noise count no more than so many standard deviations."""
-LIMIT = 5.0
-"""Standard deviations of chi-square within which the fourth reading is noise."""
-UNSURE = 0.03
-"""Share by which the estimated noise may be wrong, as a variance."""
-PART = 0.2
-"""A detector or beam that explains less than this share of the gap is not asked about."""
 STAGES = frozenset(('optics', 'psd', 'electronics'))
 """Of the effects that the fourth reading can acquit."""
 
@@ -38,7 +32,7 @@ class FourthReading:
     @property
     def allowed(self) -> float:
         """How much more than ``values`` chi-square may be of noise alone."""
-        return LIMIT * float(np.sqrt(2.0 * self.values)) + UNSURE * self.values
+        return CERTAIN_SD * float(np.sqrt(2.0 * self.values)) + SAME * self.values
 
     @property
     def acquits(self) -> bool:
@@ -74,19 +68,19 @@ def _orthonormal(rows: FloatArray) -> list[FloatArray]:
 
 def fourth_reading(ws: Workspace, residual: FloatArray) -> FourthReading:
     """Of a whitened ``residual`` (D,), measured minus simulated, of poses that are nearly right."""
-    rest = np.clip(fourth(ws, residual[None, :])[0], -CLIP, CLIP)
+    rest = np.clip(fourth(ws, residual[None, :])[0], -CERTAIN_SD, CERTAIN_SD)
     return FourthReading(float(rest @ rest), len(rest))
 
 
 def excess(ws: Workspace, residual: FloatArray) -> tuple[float, float]:
-    """Chi-square beyond noise of the dots of a whitened ``residual`` (D,), and that of each value, as ``CLIP`` has it.
+    """Chi-square beyond noise of the dots of a whitened ``residual`` (D,), and that of each value, clipped.
 
     The second is what the fourth reading could see: a dot that is far off for some moments has much of the first alone.
     """
     rows = dot_rows(len(ws.count[0]) // 3)
     there = [count[rows] > 0.0 for count in ws.count]
     dots = np.concatenate([part[rows][here] for part, here in zip(ws.split(residual), there, strict=True)])
-    clipped = np.clip(dots, -CLIP, CLIP)
+    clipped = np.clip(dots, -CERTAIN_SD, CERTAIN_SD)
     return float(dots @ dots) - len(dots), float(clipped @ clipped) / len(dots) - 1.0
 
 

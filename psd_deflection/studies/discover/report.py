@@ -20,12 +20,13 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion, other_causes
 from psd_deflection.studies.discover.law_features import known_values
 from psd_deflection.studies.discover.laws import FoundLaw
-from psd_deflection.studies.discover.search.comparison import BANDS, Comparison
+from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.predictive import Predictive
 from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.smooth import Smooth
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
+from psd_deflection.studies.discover.thresholds import BANDS
 from psd_deflection.studies.discover.trees import parameters_of, size_of
 from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.study import PageSection

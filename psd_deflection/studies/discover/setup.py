@@ -23,21 +23,9 @@ from psd_deflection.studies.check.wirings import differences, line, wirings_of
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, zero_moved
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import SMALL_MOVE
 from psd_deflection.studies.loads.plate_motion import dots_of
-
-BETTER = 10.0
-"""Factor by which another wiring or sign must leave less of the movement than the rig file's."""
-AS_GOOD = 2.0
-"""Wirings that leave up to this much more than the best one count as equally good; the one with the fewest changes is
-taken."""
-OBSERVED = 100.0
-"""A load is ignored if its movement has less than this factor of the energy of one block's noise."""
-SMALL = 1e-4
-"""m and rad; movements up to this size are in proportion to the load."""
-SHARE = 0.01
-"""By that a load is made larger, to see how the readings go with it."""
-LEAST_S, FARTHEST_S = 0.0005, 1.0
-"""Shortest and longest delay of the loads that is looked for."""
+from psd_deflection.studies.loads.thresholds import AS_GOOD, EXACT, FINE_SECONDS, MANYFOLD, ONE_DELAY_S
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +68,7 @@ def movement_sums(observations: Sequence[Observation], base: Sequence[ActiveEffe
         for k, compliance in enumerate((physics.force_compliance, physics.force_compliance, physics.torque_compliance)):
             only = np.zeros_like(o.loads)
             # Loads in a wrong unit may be thousands of times too large: the link is moved a little, in proportion.
-            share = SMALL / max(compliance * float(np.abs(o.loads[:, k]).max()), SMALL)
+            share = SMALL_MOVE / max(compliance * float(np.abs(o.loads[:, k]).max()), SMALL_MOVE)
             only[:, k] = share * o.loads[:, k]
             alone.append(_blocks(_moved(o.rig, base, only, o.temperature) - still, size) / share)
         there = np.isfinite(block_means).all(axis=0)
@@ -117,7 +105,7 @@ def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     residual = max(m.squared - float(along[at] @ sizes[at]), 0.0)
     # A load that moved nothing that stands out has no size.
     with np.errstate(invalid='ignore'):
-        sizes[sizes**2 * np.diag(m.load_products) < OBSERVED * m.noise + 1e-3 * residual] = np.nan
+        sizes[sizes**2 * np.diag(m.load_products) < MANYFOLD**2 * m.noise + 1e-3 * residual] = np.nan
     return residual, sizes
 
 
@@ -130,8 +118,8 @@ def _over_simulated(observations: Sequence[Observation], base: Sequence[ActiveEf
         rest = _blocks((o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel()).T - simulated, size)
         slopes = []
         for more in np.eye(3):
-            larger = _moved(o.rig, base, o.loads * (1.0 + SHARE * more), o.temperature)
-            slopes.append(_blocks(larger - simulated, size) / SHARE)
+            larger = _moved(o.rig, base, o.loads * (1.0 + EXACT * more), o.temperature)
+            slopes.append(_blocks(larger - simulated, size) / EXACT)
         there = np.isfinite(rest).all(axis=0)
         if there.sum() < 4:
             continue
@@ -169,7 +157,7 @@ def correct_wiring(
     lines: dict[str, object] = {}
     crossed: tuple[int, ...] = ()
     loads = np.ones(3)
-    if plain > BETTER * residual:
+    if plain > MANYFOLD * residual:
         alternatives = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
         findings, lines = wiring_findings(wiring, file, plain / residual, alternatives)
         crossed = wiring.crossed
@@ -233,7 +221,7 @@ def likely_delays(workspace: Workspace) -> list[float]:
     simulated = workspace.simulate(workspace.base)
     total: FloatArray | None = None
     step = workspace.observations[0].period * workspace.fine[0]
-    reach = round(FARTHEST_S / step)
+    reach = round(ONE_DELAY_S / step)
     for s, m, c, noise in zip(simulated, workspace.measured, workspace.count, workspace.noise, strict=True):
         for k in workspace.rows:
             there = c[k] > 0.0
@@ -253,7 +241,7 @@ def likely_delays(workspace: Workspace) -> list[float]:
         # Between two fine blocks: where a parabola has its top.
         a, b, c = total[peak - 1 : peak + 2].tolist()
         early = 0.5 * (a - c) / (a - 2.0 * b + c) * step
-        return [-early] if abs(early) >= LEAST_S else []
+        return [-early] if abs(early) >= 0.125 * FINE_SECONDS else []
     # The readings follow later than simulated: the loads are noted early.
     return sorted({-best * step, -(best + 1) * step, -(best - 1) * step} - {0.0})
 

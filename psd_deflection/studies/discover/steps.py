@@ -14,17 +14,13 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress, Step
-from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.comparison import EQUIVALENT, Comparison
 from psd_deflection.studies.discover.search.fit import Fit, heldout_gain, heldout_tables, refit
 from psd_deflection.studies.discover.search.predictive import predictive_of
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.smooth import Remainder, remainder_of
-from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical, wald_chi_square
+from psd_deflection.studies.discover.search.trials import unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
-    ALTERNATIVE_BIC,
-    EQUIVALENT,
-    EQUIVALENT_BIC,
-    SIGNIFICANT,
     Alternative,
     NamedEffect,
     Unknown,
@@ -38,11 +34,8 @@ from psd_deflection.studies.discover.search.weighing import (
     unnamed_gap,
     waterfall_of,
 )
-
-LEAST_SDS = 3.0
-"""An effect whose size is not so many standard deviations away from none is not named."""
-LITTLE = 0.1
-"""A fit that leaves less than this share of the gap is of the right effects, or nearly so."""
+from psd_deflection.studies.discover.thresholds import BIC_EQUIVALENT, BIC_GAIN, SIGNIFICANT
+from psd_deflection.studies.loads.thresholds import DISTINCT_SD, MINOR
 
 
 def solve(
@@ -66,7 +59,7 @@ def search(problem: Problem, begun: Fit | None = None) -> Problem:
         plain_search = Search(plain, problem.machine.screen, problem.progress)
         plain_search, plain_result = plain_search.run(refit(plain, ()))
         cost = plain_result.fit.chi2 + plain_search.penalty * plain_result.fit.parameters
-        if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_ACCEPT:
+        if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_GAIN:
             search_used, result = plain_search, plain_result
     search_used, result = _with_one_cause(problem, search_used, result)
     if not start.open_level:
@@ -121,7 +114,7 @@ def accepted(problem: Problem) -> Problem:
         heldout, fails = [], []
         ws, search_used, fit = problem.comparison, problem.search, problem.fit
         for i, without in enumerate(search_used.without_each(fit, problem.result.null)):
-            gain = heldout_gain(ws, without, fit, problem.rng)
+            gain = heldout_gain(ws, without, fit)
             heldout.append(gain)
             columns = fit.columns_of(i)
             chi2 = without.chi2 - fit.chi2
@@ -130,8 +123,8 @@ def accepted(problem: Problem) -> Problem:
                 not gain.significant
                 or unphysical(ws, fit, i)
                 or search_used.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
-                or bic <= BIC_ACCEPT
-                or _in_sds(ws, fit, i) < LEAST_SDS
+                or bic <= BIC_GAIN
+                or _in_sds(ws, fit, i) < DISTINCT_SD
             ):
                 fails.append((bic, i))
         problem = replace(problem, heldout=tuple(heldout))
@@ -174,7 +167,7 @@ def credible(problem: Problem) -> Problem:
 def _of_another_shape(problem: Problem) -> Problem:
     """``problem`` with a better fit of its effects, if another shape explains the little that this one leaves."""
     ws, search_used, fit, result = problem.comparison, problem.search, problem.fit, problem.result
-    limit = max(SIGNIFICANT * ws.floor(), LITTLE * problem.gap_before)
+    limit = max(SIGNIFICANT * ws.floor(), MINOR * problem.gap_before)
     if ws.open_level or ws.gap(fit.difference) > limit:
         return problem
     better = search_used.of_another_shape(fit)
@@ -227,9 +220,9 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         loss = f.chi2 - fit.chi2
         bic = loss + problem.search.penalty * (f.parameters - fit.parameters)
         rows.append((f.effects[-1].effect.name, loss, bic))
-        if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
+        if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < BIC_EQUIVALENT):
             equal.append(f)
-        if (bic < ALTERNATIVE_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
+        if (bic < BIC_GAIN or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
             fitted_alternatives.append(Alternative(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
     return NamedEffect(
         active=fit.effects[index],

@@ -13,16 +13,10 @@ from psd_deflection.recordings.time_shift import TimeShift, time_shift
 from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.steps import link_motion
+from psd_deflection.studies.loads.thresholds import BRIEF_S, DISTINCT_SD, REACH_S
 
 SKEW = 'channel_skew'
 """The effect of the catalogue that makes one PSD late."""
-REACH_S = 4.0
-"""Longest time between two PSDs that is looked for, and a little more, s."""
-ALONE_S = 0.1
-"""Largest time between two PSDs that is believed where the noted loads tell no time, s: beside a channel that does not
-work the next push may pass for this one."""
-SURE = 3.0
-"""Standard deviations by which another PSD than the first must agree better with the loads to be the one in time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,13 +78,13 @@ def aligned(rig: Rig, volts: FloatArray, loads: FloatArray) -> tuple[FloatArray,
     on_first = _moved(volts, rows)
     notes = time_shift(link_motion(rig, loads), on_first[:, dot_channels(psds)], period, REACH_S)
 
-    if notes.unknown and max(map(abs, later)) > ALONE_S:
+    if notes.unknown and max(map(abs, later)) > BRIEF_S:
         return volts, ()
 
     def off(k: int) -> tuple[int, float]:
         """PSDs that are not on the clock of PSD ``k``, and s by which the others then lag behind the loads."""
         lag = 0.0 if notes.unknown else notes.seconds
-        return sum(r != rows[k] for r in rows), abs(lag + later[k]) + (SURE * notes.sd if k else 0.0)
+        return sum(r != rows[k] for r in rows), abs(lag + later[k]) + (DISTINCT_SD * notes.sd if k else 0.0)
 
     r = min(range(psds), key=off)
     moved = [n - rows[r] for n in rows]

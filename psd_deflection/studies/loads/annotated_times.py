@@ -18,15 +18,25 @@ from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.steps import applied, link_modes, link_motion, time_of_step
+from psd_deflection.studies.loads.thresholds import (
+    APART_S,
+    AS_GOOD,
+    BRIEF_S,
+    DISTINCT_SD,
+    EXACT,
+    FEWEST_VALUES,
+    FINE_SECONDS,
+    LATE_COST,
+    ON_TIME_S,
+    ONE_DELAY_S,
+    OUTLIER_SD,
+    PART,
+    SAME,
+    SKIP_STEP,
+)
 
-SHARE = 0.02
-"""Loads that change at more than this share of the samples were measured, not noted by a person."""
-STEP = 8.0
-"""Standard deviations of a load cell's noise beyond which the load itself has changed."""
-VALUES = 20
-"""Between two steps there are at least so many values, or nothing tells noise from motion."""
-WHITE = 0.15
-"""Largest correlation of neighbouring values that is still noise."""
+ALIKE_S = 0.5 * FINE_SECONDS
+"""Notes are late alike if their delays differ by less than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,25 +55,25 @@ def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoa
     between two steps is motion, and stays.
     """
     changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
-    if len(changed) < max(SHARE * len(loads), 50):
+    if len(changed) < max(SAME * len(loads), 50):
         return loads, ()
     at = np.concatenate(([0], changed))
     values = loads[at]
     apart = np.diff(values, axis=0)
     noise = 1.4826 * np.median(np.abs(apart), axis=0) / math.sqrt(2.0)
     # A channel that measures nothing has no steps either.
-    steps = np.flatnonzero(np.any(np.abs(apart) > STEP * np.maximum(noise, 1e-9), axis=1)) + 1
+    steps = np.flatnonzero(np.any(np.abs(apart) > OUTLIER_SD * np.maximum(noise, 1e-9), axis=1)) + 1
     edges = np.concatenate(([0], steps, [len(values)]))
     out = loads.copy()
     measured = []
     for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         part = values[a:b]
         last = at[b] if b < len(at) else len(loads)
-        if b - a < VALUES:
+        if b - a < FEWEST_VALUES:
             continue
         centred = part - part.mean(axis=0)
         memory = np.abs((centred[1:] * centred[:-1]).sum(axis=0)) / np.maximum((centred**2).sum(axis=0), 1e-300)
-        if np.any(memory[noise > 0.0] > max(WHITE, 4.0 / math.sqrt(b - a))):
+        if np.any(memory[noise > 0.0] > max(PART, 4.0 / math.sqrt(b - a))):
             continue
         lengths = np.diff(np.append(at[a:b], last))
         out[at[a] : last] = (part * lengths[:, None]).sum(axis=0) / lengths.sum()
@@ -71,28 +81,6 @@ def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoa
         measured.append(MeasuredLoad(int(at[a]), int(last), sd))
     return out, tuple(measured)
 
-
-APART_S = 0.25
-"""Annotated changes that follow each other faster than this are a sweep or a ramp, not notes of a person."""
-FARTHEST_S = 30.0
-"""A note belongs to no step that is farther away."""
-ALIKE_S = 0.002
-"""Notes are late alike if their delays differ by less than this. A step of some µm is timed to a tenth of a sample."""
-ONE_DELAY_S = 0.9
-"""One delay of all loads up to this is a parameter of the searches, which fit it better."""
-GRADUAL_S = 0.1
-"""A load that took longer than this was applied slowly."""
-BETTER = 4.0
-"""Factor by which corrected times must leave less of the movement than the annotated ones."""
-SETTLED_S = 5.0
-"""Time constants of the slower mode after which a link is at rest."""
-ROUGH = 3.0
-"""Leave out the motion under a load applied slowly if its remaining ringing exceeds the noise by this factor."""
-
-_PER_SECOND = 1.0 / 5.0
-_SKIP_STEP, _SKIP_NOTE = 4.0, 9.0
-_ON_TIME_S, _ON_TIME = 0.03, 9.0
-"""If half of the notes have a step so near, those are their own: chance puts a step there once in a hundred times."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -248,11 +236,11 @@ def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> Corrected
     delays = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     # One delay is left to a search, unless it would have to find it from what was lost.
     unseen = abs(float(np.median(delays))) > ALIKE_S and any(steps[j].lost for _, j in matched)
-    if not unseen and are_alike(delays, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
+    if not unseen and are_alike(delays, ALIKE_S) and max(took for _, took in fitted.values()) <= BRIEF_S:
         return None
     corrected, timed = loads_with_times(loads, changes, fitted, period)
     residual, rest = residual_of_dots(rig, dots, corrected)
-    if BETTER * residual > residual_of_dots(rig, dots, loads)[0]:
+    if AS_GOOD * residual > residual_of_dots(rig, dots, loads)[0]:
         return None
     return replace(without_rough_motion(rig, corrected, [n for n in timed if n.wrong], rest), timed=tuple(timed))
 
@@ -260,7 +248,7 @@ def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> Corrected
 def _duration(step: DotStep, width: int, period: float) -> float:
     """Return for how many samples the dots of a gradual step move, about; 0 of a sudden one."""
     duration = step.last - step.first - 2.0 * width
-    return duration if duration > GRADUAL_S / period else 0.0
+    return duration if duration > BRIEF_S / period else 0.0
 
 
 def calm_between(steps: Sequence[DotStep], samples: int, width: int, period: float) -> list[tuple[float, float]]:
@@ -284,7 +272,7 @@ def loads_with_times(
         corrected += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
         if i in fitted:
             fx, fy, tz = loads[at].tolist()
-            notes.append(CorrectedNote(i + 1, (fx, fy, tz), annotated, start, took if took > GRADUAL_S else 0.0))
+            notes.append(CorrectedNote(i + 1, (fx, fy, tz), annotated, start, took if took > BRIEF_S else 0.0))
     return corrected, notes
 
 
@@ -346,19 +334,19 @@ def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], pe
     significant = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
     factor = sum(s.size for s in steps) / float(sizes[significant].sum())
     apart = np.abs(np.array([step.at for step in steps]) - changes[significant, None]) * period
-    on_time = apart <= _ON_TIME_S
-    least_share = _ON_TIME if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(significant) else 0.0
+    on_time = apart <= ON_TIME_S
+    least_share = DISTINCT_SD**2 if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(significant) else 0.0
     cost = np.zeros((len(significant) + 1, len(steps) + 1))
     way = np.zeros(cost.shape, dtype=np.int64)
-    cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(significant) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
+    cost[:, 0], cost[0] = DISTINCT_SD**2 * np.arange(len(significant) + 1), SKIP_STEP * np.arange(len(steps) + 1)
     way[1:, 0], way[0, 1:] = 1, 2
     for a, i in enumerate(significant, start=1):
         for b, step in enumerate(steps, start=1):
             away = float(apart[a - 1, b - 1])
             unlike = math.log(max(step.size, 1e-12) / (factor * float(sizes[i]))) / 0.5
-            pair = math.inf if away > FARTHEST_S else _PER_SECOND * away + min(unlike**2, 8.0)
+            pair = LATE_COST * away + min(unlike**2, 8.0)
             pair -= least_share * float(on_time[a - 1, b - 1])
-            ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + _SKIP_NOTE, cost[a, b - 1] + _SKIP_STEP)
+            ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + DISTINCT_SD**2, cost[a, b - 1] + SKIP_STEP)
             way[a, b] = int(np.argmin(ways))
             cost[a, b] = ways[way[a, b]]
     out = []
@@ -392,7 +380,7 @@ def residual_of_dots(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[flo
 def in_motion(rig: Rig, note: CorrectedNote, t: FloatArray) -> BoolArray:
     """Samples (n,) in which the link moves by the load of ``note``."""
     slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in link_modes(rig))
-    ends = note.applied + note.took + SETTLED_S * slowest
+    ends = note.applied + note.took - math.log(EXACT) * slowest
     return np.asarray((t >= note.applied - 0.02) & (t < ends))
 
 
@@ -405,4 +393,4 @@ def is_rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
     valid = blocks[rings & np.all(np.isfinite(blocks), axis=1)]
     if len(valid) < 4:
         return False
-    return bool(((valid - valid.mean(axis=0)) ** 2).sum(axis=1).mean() > ROUGH**2 * noise)
+    return bool(((valid - valid.mean(axis=0)) ** 2).sum(axis=1).mean() > DISTINCT_SD**2 * noise)

@@ -11,14 +11,8 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.annotated_times import SETTLED_S, CorrectedNote
+from psd_deflection.studies.loads.annotated_times import CorrectedNote
 from psd_deflection.studies.loads.holds import (
-    FEWEST,
-    PLATE,
-    PLATE_M,
-    SHARE,
-    STANDS_OUT,
-    TOLERANCE,
     Hold,
     ImpliedLoads,
     WrongNote,
@@ -27,17 +21,20 @@ from psd_deflection.studies.loads.holds import (
     implied_beside_rig,
     wrong_notes,
 )
-
-SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0
-"""A weight that sways makes so much more slow movement than any other, in this band."""
-PLATE_SHARE = 10.0
-"""And moves the plate: what no movement of the plate makes has so many times less energy."""
-SWAYS_M = 2e-6
-"""And at least this, rms."""
-TONE = 0.25
-"""Half of that movement is as near as this to its strongest frequency."""
-RINGS_S = 0.4
-"""The link has come to rest so long after a step, or nearly."""
+from psd_deflection.studies.loads.thresholds import (
+    DISTINCT_SD,
+    EXACT,
+    FEWEST_LOADS,
+    MANYFOLD,
+    OUTLIER_SD,
+    PART,
+    PLATE_M,
+    REST_S,
+    SEVERAL,
+    SLIGHT,
+    SWAY_HZ,
+    TOLERANCE,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +90,7 @@ def swaying(
     size, fine = implied.size, period * implied.size
     rows = []
     for p in implied.holds:
-        a, b = p.first // size + round(RINGS_S / fine), p.last // size
+        a, b = p.first // size + round(REST_S / fine), p.last // size
         part = implied.rest[:2, a:b]
         there = np.isfinite(part).all(axis=0)
         # How the link moved before the first sample is nobody's mistake.
@@ -104,18 +101,18 @@ def swaying(
         part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
         power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
         f: FloatArray = np.fft.rfftfreq(b - a, fine).astype(np.float64)
-        band = (f >= SLOWEST_HZ) & (f <= FASTEST_HZ)
+        band = (f >= SWAY_HZ[0]) & (f <= SWAY_HZ[1])
         moves, across = np.split(power[:, band].sum(axis=1), [2])
-        each = moves if sum(moves) > PLATE_SHARE * sum(across) else np.zeros(2)
+        each = moves if sum(moves) > MANYFOLD * sum(across) else np.zeros(2)
         axis = int(np.argmax(each))
         peak = peak_frequency(f[band], power[axis, band])
         # A step that nobody noted has no tone.
-        tone = float(power[axis, band & (np.abs(f - peak) <= TONE * peak)].sum())
+        tone = float(power[axis, band & (np.abs(f - peak) <= PART * peak)].sum())
         if peak * (b - a) * fine < 2.0 or tone < 0.5 * float(power[axis, band].sum()):
             each = np.zeros(2)
         rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / implied.compliance[axis]), peak))
     sizes = np.array([r[0] for r in rows])
-    limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
+    limit = max(OUTLIER_SD * float(np.median(sizes)), MANYFOLD * PLATE_M) if len(sizes) >= FEWEST_LOADS else np.inf
     out: dict[int, SwayingLoad] = {}
     for p, (moved, force, frequency) in sorted(zip(implied.holds, rows, strict=True), key=lambda both: both[1][0]):
         if moved > limit:
@@ -130,7 +127,7 @@ def swaying(
 def _swung(implied: ImpliedLoads, p: Hold, frequency: float, period: float) -> FloatArray:
     """(k, 3): the load in each sample of ``p`` that the link swings with: a tone whose amplitude changes slowly."""
     size, count = implied.size, p.last - p.first
-    a, b = p.first // size + round(RINGS_S / (period * size)), p.last // size
+    a, b = p.first // size + round(REST_S / (period * size)), p.last // size
 
     def tone(at: FloatArray) -> FloatArray:
         along, phase = at / count, 2.0 * math.pi * frequency * period * at
@@ -167,7 +164,7 @@ def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[Swayin
     period = 1.0 / rig.converter.sample_rate_hz
     asked = implied_beside_rig(rig, volts, loads)
     listed = find_holds(rig, volts, loads)
-    if len(listed) < FEWEST:
+    if len(listed) < FEWEST_LOADS:
         return []
     return swaying(asked(listed), find_holds(rig, volts, loads, annotated_only=True), asked, period)
 
@@ -178,7 +175,7 @@ def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> Floa
     d = rig.dynamics
     slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))
     for s in swayed:
-        out[s.hold.first : s.hold.last + round(SETTLED_S * slowest / s.period)] = np.nan
+        out[s.hold.first : s.hold.last + round(-math.log(EXACT) * slowest / s.period)] = np.nan
     return out
 
 
@@ -205,10 +202,6 @@ def _not_cut(
         all_there = sum(p.last - p.first for p in pieces) >= annotated_hold.last - annotated_hold.first
         listed += pieces if all_there else [annotated_hold]
     return implied if listed == [*implied.holds] else again(listed)
-
-
-MANY = 3
-"""Changes that nobody noted, during one annotated load."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +251,7 @@ def unannotated_times(implied: ImpliedLoads, samples: int, period: float) -> lis
 
     A change counts if the plate moves with it by what no effect does to the annotated load.
     """
-    allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(implied.annotated).max(initial=0.0))
+    allowed = DISTINCT_SD * (TOLERANCE + EXACT * np.abs(implied.annotated).max(initial=0.0))
     out = []
     numbered = groupby(range(len(implied.holds)), key=lambda k: implied.holds[k].number)
     for _, group in numbered:
@@ -266,8 +259,8 @@ def unannotated_times(implied: ImpliedLoads, samples: int, period: float) -> lis
         more = implied.more[in_group]
         steps = np.abs(np.diff(more, axis=0)).max(axis=1) > allowed
         alone = [k for k, stepped in zip(in_group[1:], steps, strict=True) if stepped and implied.holds[k].unannotated]
-        as_plate = np.abs(implied.across[in_group]).max() <= PLATE * float(implied.sizes[in_group].max()) + PLATE_M
-        if len(alone) >= MANY and as_plate:
+        as_plate = np.abs(implied.across[in_group]).max() <= SLIGHT * float(implied.sizes[in_group].max()) + PLATE_M
+        if len(alone) >= SEVERAL and as_plate:
             first, last = implied.holds[alone[0]].first, implied.holds[in_group[-1]].last
             out.append(UnannotatedTime(first, last, samples, len(alone), period))
     remaining = [
@@ -308,7 +301,7 @@ def effective_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> Effective
     steady = excluded(rig, volts, swayed)
     wrong = wrong_notes(rig, steady, loads)
     listed = find_holds(rig, volts, loads)
-    if not wrong and sum(p.unannotated for p in listed) >= MANY:
+    if not wrong and sum(p.unannotated for p in listed) >= SEVERAL:
         implied = implied_beside_rig(rig, volts, loads)(listed)
         if unannotated := unannotated_times(implied, len(loads), period):
             # What seemed to sway there was hung and taken off.

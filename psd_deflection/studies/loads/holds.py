@@ -15,45 +15,29 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.annotated_times import ordinal, unannotated_steps
-from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, across_plate, dot_rows, fine_means, moved_plate
+from psd_deflection.studies.loads.plate_motion import across_plate, dot_rows, fine_means, moved_plate
+from psd_deflection.studies.loads.thresholds import (
+    DISTINCT_SD,
+    EXACT,
+    FEWEST_LOADS,
+    FINE_SECONDS,
+    LONG_S,
+    MANYFOLD,
+    MINOR,
+    PART,
+    PLATE_M,
+    ROUND_STEPS,
+    SLIGHT,
+    TOLERANCE,
+)
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]
 
-LONG_S = 1.0
-"""Between two changes of the load there is at least this time, or it is a sweep."""
-FEWEST = 4
-"""Times between changes that a judgement needs."""
-FEWEST_RIGHT = 6
-"""Of which so many must agree for another one to be wrong: what effects do to the loads takes four numbers an axis."""
-TOLERANCE, SHARE = 0.3, 0.01
-"""N and N m, and share of the load, by which effects other than in proportion to the load may seem to change it."""
-STANDS_OUT = 3.0
-"""A few wrong notes must exceed that so many times."""
-EXACT, FEWEST_EXACT = 0.15, 5
-"""If that many others are within this share of the tolerance, those that exceed it so many times are wrong, too."""
-PLATE, PLATE_M = 0.05, 2e-7
-"""Then the readings are those of a plate: within this share of how far that load moves it, and so many metres."""
 AXES = np.array([1.0, 1.0, 0.1])
 """An angle counts by what it moves at a tenth of a metre, m/rad."""
-SOFTER, OFFSET = 0.1, 0.5
-"""Standard deviations of what effects do to a load: share, and N or N m."""
-MOST = 3.0
-"""They do no more than so many of them."""
-FAR, FAR_SHARE = 2.0, 0.1
-"""N and N m, and share of the load: what is off by more is simulated as the readings say."""
-BENT = 0.1
-"""Share of a wrong load that the others seem to be off by before it is simulated."""
 ANY = 1e9
 """Nobody says how much an effect, a sign or a unit changes a load."""
-ALONE = 0.05
-"""A load of which the others leave more than this share is like none of them."""
-STEPS = (1.0, 2.0, 5.0, 10.0)
-"""N and N m to which people round loads."""
-LEAST_STEP = 0.1
-"""Share of the step, rms, by which rounded forces are off at least: on average 0.29."""
-CLOSES = 0.2
-"""Free loads must leave less than this share of the movement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,13 +199,13 @@ def outliers(implied: ImpliedLoads, bent: float = 0.0, largest: float = ANY) -> 
     sign or another unit may change a load that no other is like.
     """
     count = len(implied.holds)
-    if np.abs(implied.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not closes(implied, CLOSES + bent):
+    if np.abs(implied.more).max(initial=0.0) < PART * DISTINCT_SD * TOLERANCE or not closes(implied, PART + bent):
         return StandingOut()
     # A detector at fault moves its dots as no plate does.
-    as_plate = np.abs(implied.across) <= PLATE * implied.sizes + PLATE_M
+    as_plate = np.abs(implied.across) <= SLIGHT * implied.sizes + PLATE_M
     off = deviation_in_tolerances(implied, (), 0.0)
     order = np.argsort(-off, kind='stable')
-    for share, right, most in ((EXACT, FEWEST_EXACT, count - FEWEST_EXACT), (1.0, FEWEST_RIGHT, 2)):
+    for share, right, most in ((PART, FEWEST_LOADS + 1, count - FEWEST_LOADS - 1), (1.0, FEWEST_LOADS + 2, 2)):
         for wrong in range(1, min(most, count - right) + 1):
             gone = order[:wrong]
             stands = are_outliers(off[gone] / share, off[order[wrong:]] / share, bent)
@@ -229,17 +213,17 @@ def outliers(implied: ImpliedLoads, bent: float = 0.0, largest: float = ANY) -> 
                 return StandingOut(tuple(sorted(gone.tolist())))
     # Two wrong ones of seven leave too few to tell what effects do.
     fitting, tried = 0, []
-    for k in range(1, count if count > FEWEST_RIGHT else 0):
-        slopes, offset = proportional_part(implied, (k,), SOFTER)
-        if np.abs(slopes).max() > MOST * SOFTER or np.abs(offset).max() > MOST * OFFSET:
+    for k in range(1, count if count > FEWEST_LOADS + 2 else 0):
+        slopes, offset = proportional_part(implied, (k,), MINOR)
+        if np.abs(slopes).max() > DISTINCT_SD * MINOR or np.abs(offset).max() > DISTINCT_SD * TOLERANCE:
             continue
-        apart = deviation_in_tolerances(implied, (k,), SOFTER)
+        apart = deviation_in_tolerances(implied, (k,), MINOR)
         remaining = np.delete(apart, k)
         fitting += bool(remaining.max() <= 1.0 + bent * apart[k])
         if are_outliers(apart[k : k + 1], remaining, bent) and is_known(implied, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
-    return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
+    return StandingOut(tuple(tried), MINOR) if len(tried) == fitting == 1 else StandingOut()
 
 
 def is_known(implied: ImpliedLoads, gone: IntArray, largest: float) -> bool:
@@ -256,8 +240,8 @@ def _alike(implied: ImpliedLoads, gone: IntArray) -> BoolArray:
     annotated = implied.annotated
     right = np.delete(annotated, gone, axis=0)
     outlying = annotated[gone]
-    rest = outlying - outlying @ np.linalg.pinv(right, rcond=ALONE) @ right
-    return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(outlying, axis=1))
+    rest = outlying - outlying @ np.linalg.pinv(right, rcond=SLIGHT) @ right
+    return np.asarray(np.linalg.norm(rest, axis=1) <= SLIGHT * np.linalg.norm(outlying, axis=1))
 
 
 def _annotated_twice(implied: ImpliedLoads, k: int) -> FloatArray | None:
@@ -270,14 +254,14 @@ def _annotated_twice(implied: ImpliedLoads, k: int) -> FloatArray | None:
         return None
     applied = 0.5 * (before + annotated)
     off = np.abs(implied.more[k] - (applied - annotated))
-    allowed = TOLERANCE + SHARE * np.abs(annotated).max() + SOFTER * np.abs(applied)
-    return applied if np.all(off <= allowed) and np.any(np.abs(applied - annotated) > STANDS_OUT * allowed) else None
+    allowed = TOLERANCE + EXACT * np.abs(annotated).max() + MINOR * np.abs(applied)
+    return applied if np.all(off <= allowed) and np.any(np.abs(applied - annotated) > DISTINCT_SD * allowed) else None
 
 
 def are_outliers(wrong: FloatArray, remaining: FloatArray, bent: float) -> bool:
     """Return whether the ``wrong`` are far off and the others are not, in tolerances."""
     rest, least = float(remaining.max()), float(wrong.min())
-    return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
+    return rest <= 1.0 + bent * least and least > max(DISTINCT_SD, 5.0 * rest)
 
 
 def proportional_part(implied: ImpliedLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
@@ -286,7 +270,7 @@ def proportional_part(implied: ImpliedLoads, gone: Sequence[int], softer: float)
         return np.zeros((3, 3)), np.zeros(3)
     keep = np.setdiff1d(np.arange(len(implied.holds)), gone)
     x = np.column_stack((implied.annotated[keep], np.ones(len(keep))))
-    prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
+    prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [0.1**2])
     both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ implied.more[keep]), dtype=np.float64)
     return both[:3], both[3]
 
@@ -295,7 +279,7 @@ def deviation_in_tolerances(implied: ImpliedLoads, gone: Sequence[int], softer: 
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
     slopes, offset = proportional_part(implied, gone, softer)
     off = np.abs(implied.more - implied.annotated @ slopes - offset)
-    allowed = TOLERANCE + SHARE * np.abs(implied.annotated).max(axis=1, keepdims=True)
+    allowed = TOLERANCE + EXACT * np.abs(implied.annotated).max(axis=1, keepdims=True)
     return np.asarray((off / allowed).max(axis=1))
 
 
@@ -304,15 +288,15 @@ def all_free(implied: ImpliedLoads, loads: FloatArray) -> bool:
 
     ``loads`` (n, 3): as the movement of ``implied`` counts them; corrected ones differ from the annotated.
     """
-    if len(implied.holds) < FEWEST or not closes(implied):
+    if len(implied.holds) < FEWEST_LOADS or not closes(implied):
         return False
-    return int(np.count_nonzero(deviation_in_tolerances(implied, (), SOFTER) > 1.0)) >= 2 or are_rounded(implied, loads)
+    return int(np.count_nonzero(deviation_in_tolerances(implied, (), MINOR) > 1.0)) >= 2 or are_rounded(implied, loads)
 
 
 def may_be_rounded(implied: ImpliedLoads) -> bool:
     """Whether the noted forces are multiples of a whole step, and ``implied`` asks for others by less than a step."""
     held = implied.annotated[np.any(implied.annotated != 0.0, axis=1)]
-    if len(held) < FEWEST:
+    if len(held) < FEWEST_LOADS:
         return False
     forces = float(steps_of(held)[0])
     return 0.0 < forces < np.inf and bool(np.all(np.abs(implied.more[:, :2]) < forces))
@@ -333,13 +317,13 @@ def rounded(annotated: FloatArray, applied: FloatArray) -> bool:
     An effect of the catalogue changes loads by little against such a step, or in proportion to them.
     """
     held = np.any(annotated != 0.0, axis=1)
-    if np.count_nonzero(held) < FEWEST:
+    if np.count_nonzero(held) < FEWEST_LOADS:
         return False
     off, annotated = (applied - annotated)[held], annotated[held]
     steps = steps_of(annotated)
-    if np.any(np.abs(off) > (0.5 + SHARE) * steps):
+    if np.any(np.abs(off) > (0.5 + EXACT) * steps):
         return False
-    return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
+    return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > MINOR * float(steps[0])
 
 
 def steps_of(annotated: FloatArray) -> FloatArray:
@@ -351,10 +335,10 @@ def largest_step(annotated: FloatArray) -> float:
     """The largest step of which all ``annotated`` numbers are multiples; infinity if all are 0, 0 if there is none."""
     if not np.any(annotated):
         return np.inf
-    return max((s for s in STEPS if np.allclose(annotated, s * np.round(annotated / s), atol=1e-6)), default=0.0)
+    return max((s for s in ROUND_STEPS if np.allclose(annotated, s * np.round(annotated / s), atol=1e-6)), default=0.0)
 
 
-def closes(implied: ImpliedLoads, share: float = CLOSES) -> bool:
+def closes(implied: ImpliedLoads, share: float = PART) -> bool:
     """Return whether other loads, constant between changes, leave next to nothing of the movement."""
     return _rms(implied.rest) < share * _rms(implied.moved)
 
@@ -433,13 +417,14 @@ def wrong_notes_against(
     ``largest``: share by which effects may change a load; signs and units are right then.
     """
     first = asked(loads)
-    if not len(first.holds) or np.abs(first.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE:
+    if not len(first.holds) or np.abs(first.more).max(initial=0.0) < PART * DISTINCT_SD * TOLERANCE:
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
     annotated = first.annotated
     readings_ask = asked(np.zeros_like(loads)).more
-    distant = np.abs(readings_ask - annotated).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
+    linear = MANYFOLD * TOLERANCE + MINOR * np.abs(readings_ask).max(axis=1)
+    distant = np.abs(readings_ask - annotated).max(axis=1) > linear
     applied = np.where(distant[:, None], readings_ask, annotated)
 
     def against() -> ImpliedLoads:
@@ -448,8 +433,8 @@ def wrong_notes_against(
         return replace(implied, more=implied.more + applied - annotated, moved=first.moved)
 
     implied = against()
-    which = outliers(implied, BENT, largest)
-    for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
+    which = outliers(implied, MINOR, largest)
+    for bent in (0.2 * MINOR, 0.0, 0.0, 0.0):
         if not which.gone:
             return []
         slopes, offset = proportional_part(implied, which.gone, which.softer)

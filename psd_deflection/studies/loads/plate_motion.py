@@ -40,9 +40,6 @@ def across_of(rig: Rig) -> FloatArray:
     return np.asarray(null_space(design_matrix(rig.centers + rig.zeros).T).T)
 
 
-FINE_SECONDS = 0.004
-
-
 def fine_means(rows: FloatArray, size: int, present: FloatArray | None = None) -> FloatArray:
     """Means (k, n // size) over ``size`` samples of rows (k, n).
 

@@ -14,11 +14,7 @@ from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-
-MOST_AROUND_S = 4.0
-"""A step among samples that are lost is looked for so far from their middle."""
-DEEP = 10.0
-"""A valley that begins so many times higher than the deepest is not followed."""
+from psd_deflection.studies.loads.thresholds import MANYFOLD, REACH_S
 
 
 def applied(t: FloatArray, start: float, took: float, period: float) -> FloatArray:
@@ -83,7 +79,7 @@ def time_of_step(
         return float(((values - moved @ slopes) ** 2).sum())
 
     middle = step.at * period
-    around = min(0.15 + step.lost * period, MOST_AROUND_S)
+    around = min(0.15 + step.lost * period, REACH_S)
     sudden = best_time(residual, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
     slow = best_time(residual, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
     start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
@@ -104,7 +100,7 @@ def best_time(
         simplex = minimize(chi_square, best, method='Nelder-Mead', options={'maxfev': 120, 'initial_simplex': corners})
         return float(simplex.fun), (float(simplex.x[0]), float(simplex.x[1]))
     around = np.concatenate(([np.inf], sizes, [np.inf]))
-    valleys = np.flatnonzero((sizes <= around[:-2]) & (sizes <= around[2:]) & (sizes <= DEEP * sizes.min()))
+    valleys = np.flatnonzero((sizes <= around[:-2]) & (sizes <= around[2:]) & (sizes <= MANYFOLD * sizes.min()))
     ends = []
     for k in valleys.tolist():
         at = starts[k][0]

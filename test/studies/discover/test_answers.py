@@ -53,8 +53,7 @@ def of_setup(name: str) -> Effect:
 
 
 def some_samples(**given: Any) -> SimulatedSamples:
-    rng = np.random.default_rng(0)
-    n = 8
+    rng, n = np.random.default_rng(0), 8
     rows = {'pose': rng.normal(size=(3, n)), 'dots': rng.normal(size=(4, n)), 'beams': rng.normal(size=(4, n))}
     t = np.arange(n, dtype=np.float64) * 1e-3
     return SimulatedSamples(t, 0.0 * t, rng.normal(size=(3, n)), Physics.of(RIG), **{**rows, **given})
@@ -400,7 +399,7 @@ def test_a_plan_says_what_it_separates() -> None:
 
 
 def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
-    """A minute costs 0.03; a further piece must add 0.02; beyond a chi-square of 60 there is nothing more to gain."""
+    """A minute costs 0.02; a further piece must add 0.02; beyond a chi-square of 60 there is nothing more to gain."""
 
     def shows(gain: float, seconds: float) -> ModelSums:
         return ModelSums(np.array([[gain]]), [], [], seconds)
@@ -411,11 +410,11 @@ def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
         value, chosen = planning.best_combination(observed, shows(0.0, 0.0), lambda s: s.apart[0], seconds)
         return value, ''.join(p.words for p in chosen)
 
-    # 30/60 - 0.005 against 25/60 - 0.0005; then the same again; then nothing is left to gain.
-    assert together(60.0) == (pytest.approx(1.0 - 0.03 * 20.0 / 60.0), 'aa')
-    assert together(11.0) == (pytest.approx(55.0 / 60.0 - 0.03 * 11.0 / 60.0), 'ab')
+    # 30/60 - 0.02/6 against 25/60 - 0.02/60; then the same again; then nothing is left to gain.
+    assert together(60.0) == (pytest.approx(1.0 - 0.02 * 20.0 / 60.0), 'aa')
+    assert together(11.0) == (pytest.approx(55.0 / 60.0 - 0.02 * 11.0 / 60.0), 'ab')
     assert together(10.9)[1] == 'a'
-    assert together(1.0) == (pytest.approx(25.0 / 60.0 - 0.0005), 'b')
+    assert together(1.0) == (pytest.approx(24.98 / 60.0), 'b')
     assert together(0.5) == (0.0, '')
     # One piece is there in any case, even if it is worth nothing.
     poor = [(Piece('c', ()), shows(0.0, 1.0))]

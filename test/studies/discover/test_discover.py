@@ -45,8 +45,7 @@ from .test_formulas import make_observation
 
 SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 SHARED_SCHEMA = Path(__file__).parents[4] / 'shared' / 'checks' / 'result.schema.json'
-RIG = load_rig()
-HISTORY = loads.identification()
+RIG, HISTORY = load_rig(), loads.identification()
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
 BANK = SignatureBank()
 NEAR = (
@@ -284,7 +283,7 @@ def workspace(law: Law | None, seed: int = 0, count: int = len(LAW_HISTORY)) -> 
 def test_there_is_no_law_in_noise() -> None:
     ws = Workspace([make_observation(3)])
     null = refit(ws, ())
-    assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print) is None
+    assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, print) is None
     assert find_jitter(ws, null, float(np.log(ws.effective_size()))) is None
 
 
@@ -323,8 +322,7 @@ def test_law_is_adopted_and_explains_recording(tmp_path: Path, monkeypatch: pyte
 def test_noise_beside_a_movement_is_no_law() -> None:
     shaky = Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),))
     ws = workspace(shaky)
-    null = refit(ws, ())
-    penalty = float(np.log(ws.effective_size()))
+    null, penalty = refit(ws, ()), float(np.log(ws.effective_size()))
     assert find_jitter(ws, null, penalty) is not None
     moved = workspace(Law('odd', 'psd', 'x1', (LawTerm('product', ('load_fy', 'load_fy'), 1e-8),)))
     # The same noise, with means of blocks that no noise explains, or of which this one makes a small part.
@@ -339,7 +337,7 @@ def test_law_with_large_held_out_gap_is_not_written(tmp_path: Path, monkeypatch:
     monkeypatch.setenv(FOLDERS, str(tmp_path))
     ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
     null = refit(ws, ())
-    law = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
+    law = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, print)
     assert law is not None
     nothing: dict[str, Any] = dict.fromkeys(f.name for f in dataclasses.fields(Discovery))
     without = Discovery(**{**nothing, 'gap_floor': ws.floor(), 'adopted': ''})
@@ -584,8 +582,7 @@ def test_a_jump_is_found_at_its_sample() -> None:
 
 @pytest.mark.parametrize('share', [0.001, 0.05])
 def test_outliers_are_excluded_and_movement_is_kept(share: float) -> None:
-    o = recorded()
-    rng = np.random.default_rng(3)
+    o, rng = recorded(), np.random.default_rng(3)
     bad = rng.random(o.volts.shape) < share
     volts = o.volts + np.where(bad, rng.choice((-1.0, 1.0), bad.shape) * rng.uniform(0.1, 5.0, bad.shape), 0.0)
     cleaned, findings = clean(dataclasses.replace(o, volts=volts), ())

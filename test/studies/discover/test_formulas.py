@@ -36,8 +36,7 @@ def make_observation(
     seed: int = 0, effects: tuple[ActiveEffect, ...] = (), name: str = 'seen', **given: Any
 ) -> Observation:
     """1.2 s of the rig with white noise of its own level."""
-    history = given.pop('history', HISTORY)
-    warm = given.pop('warm', WARM)
+    history, warm = given.pop('history', HISTORY), given.pop('warm', WARM)
     volts = ForwardModel(RIG, list(effects)).run(history, warm).volts
     volts += RIG.noises.ravel()[:, None] * np.random.default_rng(seed).standard_normal(volts.shape)
     return Observation(name, RIG, volts.T.copy(), history, warm, **given)

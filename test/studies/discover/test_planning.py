@@ -39,9 +39,10 @@ from psd_deflection.studies.discover.experiment import Limits, Setting, expected
 from psd_deflection.studies.discover.from_recordings import read_observations
 from psd_deflection.studies.discover.isolable import Isolability, Isolable, isolable
 from psd_deflection.studies.discover.noise import NoiseModel, SlowNoise, block_factor, corners_of
-from psd_deflection.studies.discover.planning import SEPARATES, Plan, plan_next
+from psd_deflection.studies.discover.planning import Plan, plan_next
 from psd_deflection.studies.discover.recorded import Recorded, with_free
 from psd_deflection.studies.discover.report import Discovery
+from psd_deflection.studies.discover.search.comparison import EQUIVALENT
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.plate_motion import fine_means
@@ -346,7 +347,7 @@ def test_sizes_are_those_whose_chi_square_a_search_accepts() -> None:
         accepted = max(by_chance, count * math.log(6 * 100) + 10.0)
         assert np.sum((shown(active) - shown()) ** 2) == pytest.approx(accepted, rel=0.1)
         assert effect.observed is not None
-        larger = max(1.0, math.sqrt(SEPARATES / effect.apart / accepted))
+        larger = max(1.0, math.sqrt(EQUIVALENT / effect.apart / accepted))
         assert effect.named == pytest.approx(larger * effect.observed, rel=1e-3)
     named = [e.named if e.named is not None else math.nan for e in listed.effects]
     np.testing.assert_array_equal(listed.table().column('named'), named)

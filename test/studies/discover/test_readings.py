@@ -135,7 +135,7 @@ def test_a_settled_reading_is_what_a_long_hold_ends_with() -> None:
 def test_rows_of_one_load_are_left_out_together() -> None:
     (parts,) = ReadingsPlant([read([])]).parts()
     assert parts[0] == parts[-1]
-    assert sorted(set(parts.tolist())) == [0, 1, 2, 3, 4, 5]
+    assert sorted(set(parts.tolist())) == list(range(8))
 
 
 @pytest.mark.slow
@@ -436,8 +436,7 @@ def test_what_is_wired_otherwise_is_reported_of_any_psd() -> None:
 
 @pytest.mark.parametrize(('rig', 'count'), [(TWO, 1), (THREE, 3), (SIX, 9)])
 def test_rows_across_movement_count_redundant_readings(rig: Rig, count: int) -> None:
-    psds = len(rig.psds)
-    rows = across_of(rig)
+    psds, rows = len(rig.psds), across_of(rig)
     assert rows.shape == (count, 2 * psds)
     assert rows @ rows.T == pytest.approx(np.eye(count), abs=1e-12)
     # x = -X + ly theta, y = -Y - lx theta.

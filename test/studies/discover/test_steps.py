@@ -100,7 +100,7 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
 
 
 @pytest.mark.parametrize('names', [('s',), ('s', 't')])
-def test_other_shapes_are_49_over_their_whole_ranges(names: tuple[str, ...]) -> None:
+def test_other_shapes_are_24_over_their_whole_ranges(names: tuple[str, ...]) -> None:
     tried: list[tuple[float, ...]] = []
 
     class Noting(Plant):
@@ -117,8 +117,9 @@ def test_other_shapes_are_49_over_their_whole_ranges(names: tuple[str, ...]) -> 
     fit = refit(plant, [shaped, active('b', x=0.0)], iterations=0)
     tried.clear()
     searching(plant, plant.pictures, 'a').of_another_shape(fit)
-    inside = np.linspace(-1.0, 1.0, {1: 51, 2: 9}[len(names)])[1:-1].tolist()
-    np.testing.assert_allclose(tried[:49], list(itertools.product(inside, repeat=len(names))), atol=1e-12)
+    inside = np.linspace(-1.0, 1.0, {1: 26, 2: 7}[len(names)])[1:-1].tolist()
+    wanted = list(itertools.product(inside, repeat=len(names)))
+    np.testing.assert_allclose(tried[: len(wanted)], wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize(('late', 'again'), [(1.2, True), (0.8, False)])
@@ -162,7 +163,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     null = refit(plant, ())
     first = mistake(search, null, search.screen.score(null.residual))
     assert named(first) == ['sample_rate']
-    assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
+    assert {-0.2, -0.1, -0.05, 0.05, 0.1, 0.25} <= set(tried)
 
 
 def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,11 +189,10 @@ def test_effects_are_added_until_budget_ends(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize(
     ('gain', 'share', 'tried'),
-    [(gain, *row) for gain in (900.0, 9e4) for row in ((0.57, []), (0.63, [['b']]))]
+    [(gain, *row) for gain in (900.0, 9e4) for row in ((0.47, []), (0.53, [['b']]))]
     + [(99.5, 0.45, []), (99.5, 0.55, [['b']])],
 )
-def test_what_explains_six_tenths_is_tried_instead(gain: float, share: float, tried: list[list[str]]) -> None:
-    """Of an effect that shows little, half."""
+def test_what_explains_half_is_tried_instead(gain: float, share: float, tried: list[list[str]]) -> None:
     shown = pictures(A, B)
     shown[B] = math.sqrt(share) * shown[A] + math.sqrt(1.0 - share) * across(shown[B], shown[A])
     plant = Plant(shown, without_noise((shown[A], gain)))

@@ -23,6 +23,7 @@ from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.alignment import aligned
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
+from psd_deflection.studies.loads.thresholds import DISTINCT_SD
 from test.studies.held_loads import RIG, answers, read
 
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
@@ -357,7 +358,7 @@ def cheapest(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period:
                 for i, j in pairs:
                     away = abs(steps[j].at - changes[i]) * period
                     unlike = 2.0 * math.log(max(steps[j].size, 1e-12) / factor / sizes[i])
-                    cost += away / 5.0 + min(unlike**2, 8.0) if away <= 30.0 else math.inf
+                    cost += away / 5.0 + min(unlike**2, 8.0)
                     cost -= bonus if away <= 0.03 else 0.0
                 if cost < best[0]:
                     best = cost, pairs
@@ -532,7 +533,7 @@ def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     correction = annotated_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
     assert correction.loads is loads
     assert correction.notes == (sudden, rough)
-    ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
+    ends = 2.5 - math.log(0.01) / (2.0 * math.pi * 14.0 * 0.02)
     assert np.flatnonzero(correction.unused).tolist() == list(range(1980, math.floor(1000.0 * ends) + 1))
     rest = quiet.copy()
     rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
@@ -617,7 +618,7 @@ def test_ringing_beyond_the_noise_of_the_blocks_is_rough(share: float, rough: bo
     """Blocks of +-1 um differ by 2 um: a variance of 2 um^2, ``ROUGH`` squared of which may ring."""
     rest = 1e-6 * np.resize([[1.0, 0.0], [-1.0, 0.0]], (100, 2))
     ringing = np.arange(100) < 10
-    rest[ringing] = share * annotated_times.ROUGH * math.sqrt(2e-12) * np.repeat([[0.0, 1.0], [0.0, -1.0]], 5, axis=0)
+    rest[ringing] = share * DISTINCT_SD * math.sqrt(2e-12) * np.repeat([[0.0, 1.0], [0.0, -1.0]], 5, axis=0)
     assert annotated_times.is_rough(np.repeat(rest, 4, axis=0), np.repeat(ringing, 4), 4) is rough
 
 

@@ -9,15 +9,20 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
+from scipy.special import ndtri
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.base.charts import TimeAxis
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.thresholds import BANDS, BUDGET, P_CHANCE, P_LIBRARY, P_STRONG
+from psd_deflection.studies.loads.thresholds import SIMULATION_ERROR
 
-EXCEEDED = 1e-3
-"""Share of recordings whose gap from noise alone is more than the most that is expected of noise."""
+EQUIVALENT = round(4.0 * float(ndtri(1.0 - P_CHANCE)) ** 2, 1)
+"""Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
+lambda sin²(theta/2) = z² one in a hundred would be misnamed, and sin²(theta) is four times that.
+"""
 
 
 class SimulationCount:
@@ -51,10 +56,9 @@ class Comparison(ABC):
     first: frozenset[str] = frozenset()
     setup: frozenset[str] = frozenset()
     open_level: bool = False
-    budget: int = 700
+    budget: int = BUDGET
     most_budgets: float = 4
-    # At 1e-3, where BIC alone ends in a recording of minutes, one of 1000 without fault has an effect by chance.
-    p_accept: float = 1e-4
+    p_accept: float = P_LIBRARY
     digits: str = '.4g'
     correlated: bool = False
 
@@ -125,7 +129,7 @@ class Comparison(ABC):
     def noise_limit(self) -> float:
         """Return the gap that noise alone exceeds in one of a thousand recordings; NaN if nobody knows the noise."""
         size = self.effective_size() * len(self.channels) / len(self.measured[0])
-        return self.floor() * float(np.sqrt(chi2_law.isf(EXCEEDED, size) / size))
+        return self.floor() * float(np.sqrt(chi2_law.isf(P_STRONG, size) / size))
 
     @abstractmethod
     def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -208,13 +212,6 @@ class Comparison(ABC):
         return self.whiten(difference), difference
 
 
-RELATIVE = 0.002
-"""Share of the explained movement, as an amplitude, by which the simulation may be wrong."""
-
-BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
-"""Edges, Hz; the last band has no upper end."""
-
-
 def energies(workspace: Comparison, vector: FloatArray) -> FloatArray:
     """Chi-square of a whitened vector (D,) by recording, channel and band: (recordings, channels, bands)."""
     out = []
@@ -241,5 +238,5 @@ def gain_beyond(workspace: Comparison, smaller: FloatArray, larger: FloatArray, 
     if not np.any(explained):
         return float(smaller @ smaller - larger @ larger)
     gain = energies(workspace, smaller) - energies(workspace, larger)
-    allowed = RELATIVE**2 * energies(workspace, explained)
+    allowed = SIMULATION_ERROR**2 * energies(workspace, explained)
     return float(gain[(gain > allowed) | (gain < 0.0)].sum())

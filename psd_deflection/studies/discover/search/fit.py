@@ -12,12 +12,7 @@ import numpy.typing as npt
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
-
-STEP = 0.05
-"""Step of the finite difference, in units of the parameter's scale."""
-
-STOP = 0.05
-"""A refit ends when an iteration gains less than this in chi-square."""
+from psd_deflection.studies.discover.thresholds import ROUNDING, STEP, STOP
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -173,13 +168,6 @@ def refit(
     return Fit(final[count:], chi2, residual, difference, jacobian, tuple(named), bound, final[:count])
 
 
-BOOTSTRAPS = 400
-
-
-RIDGE = 1e-6
-"""Of the squared length of a signature: so little of it on the cases of a fit does not tell its size."""
-
-
 def fold_steps(
     workspace: Comparison, fit: Fit, home: bool = False
 ) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
@@ -198,9 +186,9 @@ def fold_steps(
         test = folds == fold
         jt, rt = j[test], fit.residual[test]
         f = full_f - jt.T @ jt
-        f[np.diag_indices_from(f)] += RIDGE
+        f[np.diag_indices_from(f)] += ROUNDING
         step = np.zeros(len(lengths))
-        asked = full_g - jt.T @ rt + RIDGE * away * lengths
+        asked = full_g - jt.T @ rt + ROUNDING * away * lengths
         step[free] = np.linalg.lstsq(f[np.ix_(free, free)], asked[free], rcond=1e-9)[0]
         yield test, step / lengths
 
@@ -282,7 +270,7 @@ def unseen_gap(workspace: Comparison, fit: Fit, columns: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """``gain``: log-likelihood gained on unseen load cases; ``error``: its block-bootstrap standard error."""
+    """``gain``: log-likelihood gained on unseen load cases; ``error``: its standard error, by pieces."""
 
     gain: float
     error: float
@@ -293,15 +281,15 @@ class HeldOut:
         return self.gain > 2.0 * self.error
 
 
-def heldout_gain(workspace: Comparison, without: Fit, fit: Fit, rng: np.random.Generator) -> HeldOut:
+def heldout_gain(workspace: Comparison, without: Fit, fit: Fit) -> HeldOut:
     """Gain of ``fit`` over ``without`` on unseen load cases.
 
-    The standard error is the smaller of the block bootstrap's and that of the likelihood ratio
-    itself, because the former is meaningless for an effect that shows only in a few short intervals. No other case can
-    speak for or against what one case alone shows: that keeps its size here, and BIC decides.
+    The standard error is the smaller of that of the sum of its pieces (a block bootstrap's, in closed form) and that of
+    the likelihood ratio itself, because the former is meaningless for an effect that shows only in a few short
+    intervals. No other case can speak for or against what one case alone shows: that keeps its size here, and BIC
+    decides.
     """
     piece = workspace.pieces(heldout_residual(workspace, without, False), heldout_residual(workspace, fit, False))
-    draws = rng.integers(0, len(piece), size=(BOOTSTRAPS, len(piece)))
-    deviation = float(np.std(piece[draws].sum(axis=1)))
+    deviation = float(np.sqrt(len(piece)) * np.std(piece))
     gain = float(piece.sum())
     return HeldOut(gain, min(deviation, float(np.sqrt(2.0 * max(abs(gain), 1.0)))))

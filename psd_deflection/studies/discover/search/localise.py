@@ -12,13 +12,11 @@ from scipy.stats import chi2 as chi2_law
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray, IntArray, channel_names
 from psd_deflection.studies.discover.hidden import only_in
-from psd_deflection.studies.discover.search.comparison import BANDS, RELATIVE, Comparison
+from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.thresholds import BANDS, CERTAIN_SD, DRAWS, P_CHANCE
 from psd_deflection.studies.loads.plate_motion import fine_means
-
-CLIP = 6.0
-"""Whitened values are limited to this, so outliers of heavy-tailed noise do not count as structure."""
-DRAWS = 39
+from psd_deflection.studies.loads.thresholds import SIMULATION_ERROR
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +106,7 @@ def _energies(
     for i, layout in enumerate(layouts):
         span = slice(layout.start, layout.stop)
         power = _power(parts[layout.recording][:, span])
-        wrong = None if explained is None else RELATIVE**2 * _power(explained[layout.recording][:, span])
+        wrong = None if explained is None else SIMULATION_ERROR**2 * _power(explained[layout.recording][:, span])
         n = layout.stop - layout.start
         for band, index in enumerate(layout.bins):
             if len(index) == 0:
@@ -194,7 +192,7 @@ def dependences(
         wrong = 0.0
         if explained is not None:
             channel_values = np.concatenate([part[c] for part in workspace.split(explained)])
-            wrong = RELATIVE * np.sqrt(lengths) * np.linalg.norm(channel_values)
+            wrong = SIMULATION_ERROR * np.sqrt(lengths) * np.linalg.norm(channel_values)
         f = lengths.copy()
         if q is not None:
             fitted = np.stack([np.concatenate([part[c] for part in workspace.split(col)]) for col in q.T])
@@ -228,7 +226,7 @@ def localise(
     """
     layouts = _layouts(workspace)
     apart = None if explained is None else workspace.split(explained)
-    z, _ = _energies(workspace.split(np.clip(residual, -CLIP, CLIP)), layouts, apart)
+    z, _ = _energies(workspace.split(np.clip(residual, -CERTAIN_SD, CERTAIN_SD)), layouts, apart)
     raw_z, raw_excess = _energies(workspace.split(residual), layouts, apart)
     maxima = np.empty(DRAWS)
     q = None
@@ -252,7 +250,7 @@ def localise(
     depends = dependences(workspace, regressors(workspace), residual, known, explained)
     main: dict[str, list[str]] = {}
     for d in depends:
-        if d.p < 0.01 and len(main.setdefault(d.channel, [])) < 2:
+        if d.p < P_CHANCE and len(main.setdefault(d.channel, [])) < 2:
             name = plain_word(d.regressor)
             if name not in main[d.channel]:
                 main[d.channel].append(name)
@@ -263,16 +261,16 @@ def localise(
         layout = layouts[int(i)]
         value = float(z[i, c, b])
         # The clipped statistic decides significance; the unclipped one ranks clear cases better.
-        shown = float(raw_z[i, c, b]) if p_of(value) < 0.01 else value
+        shown = float(raw_z[i, c, b]) if p_of(value) < P_CHANCE else value
         when = (layout.start * layout.period, layout.stop * layout.period)
         band = (BANDS[int(b)], min(BANDS[int(b) + 1], 0.5 / layout.period))
         channel = channels[int(c)]
-        names = tuple(main.get(channel, [])) if BANDS[int(b)] < 25.0 else ()
+        names = tuple(main.get(channel, [])) if BANDS[int(b)] < BANDS[4] else ()
         cells.append(Cell(channel, layout.recording, when, band, names, shown, p_of(value), float(raw_excess[i, c, b])))
     cells.sort(key=lambda cell: -cell.statistic)
-    significant = np.array([p_of(v) < 0.01 for v in z.ravel()])
+    significant = np.array([p_of(v) < P_CHANCE for v in z.ravel()])
     total = float(raw_excess.ravel()[significant].sum())
-    total = max(total, depends[0].gain if depends and depends[0].p < 0.01 else 0.0)
+    total = max(total, depends[0].gain if depends and depends[0].p < P_CHANCE else 0.0)
     p = min(1.0, 2.0 * min(p_of(float(z.max())), depends[0].p if depends else 1.0))
     spans = tuple((x.recording, x.start * x.period, x.stop * x.period) for x in layouts)
     return Localisation(tuple(cells), tuple(depends), total, p, raw_z, spans)

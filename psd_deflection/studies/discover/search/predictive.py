@@ -15,9 +15,10 @@ from scipy.special import stdtr
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import STEP, Fit
+from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.screen import Candidate, Screen
 from psd_deflection.studies.discover.search.trials import slot, unbound
+from psd_deflection.studies.discover.thresholds import STEP
 
 MOST_FOLDS = 11
 """Parts are joined to so many groups, each left out in turn."""

@@ -10,12 +10,8 @@ from scipy.optimize import minimize_scalar
 
 from psd_deflection.recordings.observation import Observation
 from psd_deflection.records import FloatArray, dot_channels
-
-LEAST_THERE = 0.1
-"""Share of the samples of a quarter that tell whether a line is there."""
-FEWEST_QUARTERS = 3
-PEAK = 40.0
-"""A spectral line must exceed the median power around it by this factor (chance: 1e-12 per bin)."""
+from psd_deflection.studies.discover.thresholds import LINE
+from psd_deflection.studies.loads.thresholds import MINOR, SEVERAL
 
 
 def spectral_peaks(
@@ -40,7 +36,7 @@ def spectral_peaks(
         t = np.arange(n, dtype=np.float64) * period
         for _ in range(limit):
             k = int(np.argmax(power))
-            if not power[k] > PEAK * median:
+            if not power[k] > LINE * median:
                 break
             strongest = np.ascontiguousarray(scaled[:, int(np.argmax(each[k]))] * window)
 
@@ -80,8 +76,8 @@ def persistent(
             scaled = residual[: 4 * n] / sigma
             there = np.any(scaled != 0.0, axis=1)
             shares = there.reshape(4, n).mean(axis=1)
-            persistent_terms = shares >= LEAST_THERE
-            if persistent_terms.sum() < FEWEST_QUARTERS:
+            persistent_terms = shares >= MINOR
+            if persistent_terms.sum() < SEVERAL:
                 steady = False
                 break
             centred = np.where(there[:, None], scaled - scaled[there].mean(axis=0), 0.0)

@@ -20,6 +20,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.hidden import Free
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.thresholds import ROUNDING
 
 Columns = Sequence[Sequence[npt.NDArray[np.floating[Any]]]]
 """Per column, per recording: fine-block volts (3P, nf), of the precision of a screen."""
@@ -182,12 +183,6 @@ class SignatureBank:
         return columns
 
 
-OBSERVED = 1e-6
-"""Columns that keep less than this fraction of their squared length after projection are skipped as
-already explained.
-"""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
     """``gain``: expected drop of chi-square; ``dof`` columns; ``p``: library-wide, by Sidak."""
@@ -223,7 +218,7 @@ def solve_observable(fisher: FloatArray, score: FloatArray, original: FloatArray
     f = fisher / np.outer(scale, scale)
     g = score / scale
     values, vectors = np.linalg.eigh(f)
-    keep = values > OBSERVED
+    keep = values > ROUNDING
     if not np.any(keep):
         return 0.0, 0, np.zeros_like(score)
     along = vectors[:, keep].T @ g

@@ -16,10 +16,6 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.screen import Score, Screen
 from psd_deflection.studies.discover.search.trials import (
-    BIC_ACCEPT,
-    MOST_CLOSED,
-    NEAR,
-    STANDS_IN,
     Limit,
     Trials,
     effect_count,
@@ -31,20 +27,12 @@ from psd_deflection.studies.discover.search.trials import (
     wald_chi_square,
     words_of_terms,
 )
+from psd_deflection.studies.discover.thresholds import BIC_GAIN, HALF, LIKELY, OTHER_ERRORS, PAIRS, ROUNDS, SURE
+from psd_deflection.studies.loads.thresholds import EXACT, MINOR, PART
 
-LIKELY = 0.3
-"""A mistake of the set-up is tried if it explains, to first order, this share of what the best candidate explains."""
-NEARLY_ALL = 0.01
-"""A mistake of the set-up is taken before any effect if it alone leaves less than this share of the chi-square beyond
-noise."""
-OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
 LATE = 'load_delay'
 RINGING = ('bending_frequency', 'torsion_frequency')
 """Mistakes about the natural frequencies, which may be wrong both."""
-OTHER_FREQUENCIES, RINGS = (-0.1, -0.05, -0.02, 0.02, 0.05, 0.1), 0.005
-"""They are tried from these errors, too, if they explain this share of what the best candidate explains."""
-FARTHEST_ERROR, HALVED = -0.7, -0.5
-"""A linear step to an error of a sensitivity below the first starts at the second instead (readings twice as large)."""
 
 
 def mistake(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit:
@@ -68,7 +56,7 @@ def _nearly_all(trials: Trials, null: Fit, fit: Fit | None) -> bool:
     size = trials.workspace.size
     if fit is None or not trials.passes(null, fit, null):
         return False
-    return fit.chi2 - size <= NEARLY_ALL * (null.chi2 - size)
+    return fit.chi2 - size <= EXACT * (null.chi2 - size)
 
 
 def _delays_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit | None:
@@ -78,7 +66,7 @@ def _delays_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score])
     if alone is None or not trials.passes(null, alone, null):
         return None
     both = _effect_beside_delays(trials, alone, trials.screen)
-    if is_far_off(alone) and not _nearly_all(trials, null, both) and alone.chi2 < MOST_CLOSED * null.chi2:
+    if is_far_off(alone) and not _nearly_all(trials, null, both) and alone.chi2 < HALF * null.chi2:
         # Late loads hide the spectral lines of a small effect, and change its signature.
         both = _effect_beside_delays(trials, alone, trials.screen_beside(alone))
     return both if both is not None and trials.passes(alone, both, null) else None
@@ -98,14 +86,15 @@ def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[A
         if s.candidate.effect.name not in trials.workspace.first:
             continue
         start, name = s.candidate.from_coefficients(s.coefficients), s.candidate.effect.name
-        if name == 'sensitivity' and start.values['error'] < FARTHEST_ERROR:
-            start = ActiveEffect(start.effect, {'error': HALVED})
+        if name == 'sensitivity':
+            # A linear step goes too far when readings are twice as large.
+            start = ActiveEffect(start.effect, {'error': max(start.values['error'], -HALF)})
         if s.gain > LIKELY * best:
             starts.append([start])
         if name == 'sample_rate' and is_far_off(null):
             # A linear step does not reach another frequency of the ringing.
-            starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
-    return starts + _frequency_starts(trials, null, [s for s in scores if s.gain > RINGS * best])
+            starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_ERRORS]
+    return starts + _frequency_starts(trials, null, [s for s in scores if s.gain > EXACT * best])
 
 
 def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
@@ -120,7 +109,7 @@ def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> lis
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
     """Return the best start for another natural frequency: from far away a linear step does not reach it."""
     start = score.candidate.from_coefficients(score.coefficients)
-    starts = OTHER_FREQUENCIES if is_far_off(beside) else ()
+    starts = OTHER_ERRORS if is_far_off(beside) else ()
     return min(
         [start, *(ActiveEffect(start.effect, {'error': v}) for v in starts)],
         key=lambda a: ws.loss(ws.residual([*ws.base, *beside.coefficients_with_nuisance, a])[0]),
@@ -131,20 +120,6 @@ def _is_a_mass(fit: Fit) -> bool:
     """Whether a lower frequency of the bending is all: a mass at the tip does the same, and the catalogue has it."""
     ringing = [a for a in fit.effects if a.effect.name in RINGING]
     return len(ringing) == 1 and ringing[0].effect.name == RINGING[0] and ringing[0].values['error'] < 0.0
-
-
-ROUNDS = 3
-"""How often effects are added: again only if the noise beside those found is another than before."""
-PAIRS = 5
-PAIRS_OPEN = 15
-"""Pairs that are refitted: more of them if the model of the machine is rough and its signatures are not small."""
-SAME = 0.1
-"""A wrong number of the rig file does the same as some effects if so small a share of its signature is left."""
-SWAP_REACH = 0.6
-"""An alternative is refitted only if it explains this fraction of what the named effect explains."""
-
-CHOICE_REACH = 0.5
-"""Another choice of an effect that is there is tried if it explains this fraction of what the best further one does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +201,7 @@ class Search(Trials):
             excess = current.chi2 - self.workspace.size
             sizes = [wald_chi_square(self.workspace, current, i) for i in range(len(current.effects))]
             weakest = int(np.argmin(sizes))
-            if excess <= NEAR * self.workspace.size or sizes[weakest] >= excess:
+            if excess <= MINOR * self.workspace.size or sizes[weakest] >= excess:
                 break
             self.log(f'{current.effects[weakest].label} explains less than what remains')
             rest = [a for i, a in enumerate(current.effects) if i != weakest]
@@ -237,11 +212,11 @@ class Search(Trials):
         """Return whether a swap closed most of what was open, and left something."""
         size = self.workspace.size
         excess = current.chi2 - size
-        return excess < MOST_CLOSED * (before.chi2 - size) and excess > NEAR * size
+        return excess < HALF * (before.chi2 - size) and excess > MINOR * size
 
     def _limits(self, current: Fit) -> tuple[Limit, ...]:
         """Return the limit that kept further effects out, with what lies beyond it."""
-        within_noise = current.chi2 <= (1.0 + NEAR) * self.workspace.size and not self.workspace.open_level
+        within_noise = current.chi2 <= (1.0 + MINOR) * self.workspace.size and not self.workspace.open_level
         if not self._stopped or within_noise:
             return ()
 
@@ -280,7 +255,7 @@ class Search(Trials):
     def _looks_closer(self, current: Fit) -> bool:
         """Whether the signatures are new: those beside ``current``, if it leaves something that no other explains."""
         known = self._beside == tuple(a.label for a in current.effects)
-        within_noise = current.chi2 <= (1.0 + NEAR) * self.workspace.size
+        within_noise = current.chi2 <= (1.0 + MINOR) * self.workspace.size
         if known or within_noise or self.spent >= self.budget_of(current):
             return False
         self._screen_anew(current)
@@ -307,7 +282,7 @@ class Search(Trials):
                 return better
             self._stopped = (
                 f'{better.effects[-1].effect.name} beside {effect_count(current)} explains less than '
-                f'{STANDS_IN:.0%} of what remains: it may only stand in for what the library lacks'
+                f'{PART:.0%} of what remains: it may only stand in for what the library lacks'
             )
         # Of two causes of a rough machine neither may help alone, and a wrong first effect hides a pair.
         if len(current.effects) >= 2 or not (ws.open_level or passes):
@@ -321,10 +296,10 @@ class Search(Trials):
 
         ``screened``: what each candidate explains beside it; ``least``: the best of an effect that is not there yet.
         """
-        if self.workspace.open_level or current.chi2 <= (1.0 + NEAR) * self.workspace.size:
+        if self.workspace.open_level or current.chi2 <= (1.0 + MINOR) * self.workspace.size:
             return None
         known, best = {key_of(a) for a in current.effects}, current
-        other_choices = [s for s in screened if s.gain >= CHOICE_REACH * least and s.candidate.variant not in known]
+        other_choices = [s for s in screened if s.gain >= HALF * least and s.candidate.variant not in known]
         for i, active in enumerate(current.effects):
             place = slot(active.effect, active.values)
             mine = [
@@ -335,7 +310,7 @@ class Search(Trials):
                 moved = ActiveEffect(active.effect, {**active.values, **choices})
                 rest = [*current.effects[:i], *current.effects[i + 1 :]]
                 best = min(best, refit(self.workspace, [*rest, moved], iterations=8), key=self.bic)
-        if self.bic(best) > self.bic(current) - BIC_ACCEPT:
+        if self.bic(best) > self.bic(current) - BIC_GAIN:
             return None
         self.log(f'choosing {best.effects[-1].label}')
         return best
@@ -375,23 +350,23 @@ class Search(Trials):
             (column,) = self.screen.columns_of(candidate)
             share = np.linalg.lstsq(jacobian, column, rcond=1e-9)[0]
             size = float(np.linalg.norm(column))
-            if np.linalg.norm(column - jacobian @ share) > SAME * size:
+            if np.linalg.norm(column - jacobian @ share) > MINOR * size:
                 continue
             parts = np.linalg.norm(jacobian, axis=0) * np.abs(share)
-            same = {current.free[j][0] for j, part in zip(keep, parts, strict=True) if part > SAME * size}
+            same = {current.free[j][0] for j, part in zip(keep, parts, strict=True) if part > MINOR * size}
             if any(current.effects[i].effect.name in self.workspace.setup for i in same):
                 continue
             rest = [a for i, a in enumerate(current.effects) if i not in same]
             start = candidate.from_coefficients(np.array([0.0]))
             best = min(best, refit(self.workspace, [*rest, start], iterations=12), key=self.bic)
-        if self.bic(best) > self.bic(current) - 0.5 * BIC_ACCEPT:
+        if self.bic(best) > self.bic(current) - 0.5 * BIC_GAIN:
             return current
         self.log('one cause: ' + ', '.join(a.label for a in best.effects))
         return best
 
     def _try_pairs(self, null: Fit, current: Fit) -> Fit:
         pairs = self.screen.pairs(
-            null.residual, self.penalty, PAIRS_OPEN if self.workspace.open_level else PAIRS, unbound(null)
+            null.residual, self.penalty, 3 * PAIRS if self.workspace.open_level else PAIRS, unbound(null)
         )
         starts = []
         for a, b, _ in pairs:
@@ -440,14 +415,14 @@ class Search(Trials):
         if any(a.effect.name not in self.workspace.setup for a in rest):
             taken |= self.workspace.first
         # Screening is linear: a candidate that falls short by little needs a full refit.
-        bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
+        bar = min(HALF * gain, gain - SURE) if gain > 100.0 else 0.5 * gain
         if self.workspace.open_level:
             # A rough machine is far from linear.
             bar = 0.0
         best: dict[str, Score] = {}
         for s in self.screen.score(without.residual, unbound(without)):
             name = s.candidate.effect.name
-            least = RINGS * gain if name in RINGING and is_far_off(without) else bar
+            least = EXACT * gain if name in RINGING and is_far_off(without) else bar
             if name not in taken and s.gain >= least:
                 best.setdefault(name, s)
         return sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.budget_of(current) else 2]
@@ -467,7 +442,7 @@ class Search(Trials):
                 frequency(self.workspace, without, s) if ringing else s.candidate.from_coefficients(s.coefficients)
             )
             quick = refit(self.workspace, [*rest, alternative], iterations=10 if self.workspace.open_level else 3)
-            if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self.budget_of(current):
+            if quick.chi2 - current.chi2 < max(SURE, PART * gain) and self.spent < 2 * self.budget_of(current):
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
         fits.sort(key=lambda f: f.chi2)

@@ -21,19 +21,16 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, heldout_gap, unseen_gap
 from psd_deflection.studies.discover.search.localise import Localisation
 from psd_deflection.studies.discover.search.weighing import Unknown
-
-FEWEST, MOST = 20, 150
-"""Values of a channel between which a function is looked for: fewer tell none, more take too long."""
-FEWEST_CASES = 8
-"""Parts left out in turn that a function needs to be confirmed."""
-CLOSES = 0.5
-"""Share of the energy of what remains on unseen cases that the function must close there."""
-SIZES, LENGTHS, NOISES = (0.05, 20.0), (0.08, 8.0), (0.02, 2.0)
-"""Bounds of the size and the noise, in standard deviations of a channel; of the length, in those of a variable."""
-START = (1.0, 0.5, 0.5)
-"""Size, length and noise that the fit begins with."""
-WORTH = 10.0
-"""A further variable must raise twice the log-likelihood by so much, as a named effect must BIC."""
+from psd_deflection.studies.discover.thresholds import (
+    BIC_GAIN,
+    FEWEST_CASES,
+    HALF,
+    LEVELS,
+    MOST_VALUES,
+    P_STRONG,
+    RANGE,
+)
+from psd_deflection.studies.loads.thresholds import FEWEST_VALUES
 
 BoolArray = npt.NDArray[np.bool_]
 Variables = Mapping[str, Sequence[FloatArray]]
@@ -82,7 +79,7 @@ def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
     counts = np.bincount(channel[there], minlength=len(ws.channels))
     folds = ws.folds()[ws.row_cases()]
     parts = len(np.unique(folds[there]))
-    if parts < FEWEST_CASES or counts.min() < FEWEST or len(there) > MOST * len(counts):
+    if parts < FEWEST_CASES or counts.min() < FEWEST_VALUES or len(there) > MOST_VALUES * len(counts):
         return None
     free = np.array([name not in fit.at_bound for name in fit.free], dtype=bool)
     apart = {name: _distances(ws, values) for name, values in variables.items()}
@@ -96,7 +93,7 @@ def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
         return ws.gap([d + c for d, c in zip(fit.difference, change, strict=True)])
 
     heldout, before = gap(shaped=False), heldout_gap(ws, fit)
-    if heldout**2 > (1.0 - CLOSES) * before**2:
+    if heldout**2 > (1.0 - HALF) * before**2:
         return None
     sizes = np.zeros(len(fit.free))
     _, value, sizes[free] = _known(remains, chosen, shapes, there)
@@ -120,7 +117,7 @@ def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
         tried = [(*names, name) for name in remains.apart if name not in names]
         fitted = [(*_shaped(remains, more), more) for more in tried]
         best = max(fitted, key=lambda row: row[1], default=None)
-        if best is None or 2.0 * (best[1] - likelihood) < WORTH:
+        if best is None or 2.0 * (best[1] - likelihood) < BIC_GAIN:
             return names, shapes
         shapes, likelihood, names = best
 
@@ -128,8 +125,8 @@ def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
 def _shaped(remains: Remainders, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Logarithms (channels, 1 + 2 len(names)) of noise, then size and length of each, and the likelihood of all."""
     channels = np.unique(remains.channel)
-    usual = np.log([START[2], *(START[0], START[1]) * len(names)])
-    low, high = np.log([NOISES, *(SIZES, LENGTHS) * len(names)]).T
+    usual = np.full(1 + 2 * len(names), 0.5 * np.log(RANGE[0] * RANGE[1]))
+    low, high = np.tile(np.log(RANGE), (len(usual), 1)).T
     begin = np.tile(usual, (len(channels), 1)) if start is None else start
     bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
     basis = orthonormal_basis(remains.sizes)
@@ -227,11 +224,6 @@ def unseen_residual(
     return out
 
 
-STRONG_P = 1e-3
-"""Largest library-wide p of a regressor that takes part."""
-MOST_REGRESSORS = 24
-"""Regressors, over all channels, that take part at most: the strongest."""
-
 Table = Sequence[tuple[str, Mapping[str, Sequence[FloatArray]]]]
 """Of each channel its name and its regressors (n,) of each recording, by name."""
 
@@ -271,7 +263,7 @@ def remainder_of(ws: Comparison, fit: Fit, residual: Localisation, table: Table)
 
     None if there are none, or if they predict nothing on unseen load cases.
     """
-    strong = [d for d in residual.dependences if d.p < STRONG_P][:MOST_REGRESSORS]
+    strong = [d for d in residual.dependences if d.p < P_STRONG][:LEVELS]
     if not strong:
         return None
     columns = [fit.jacobian[:, j] for j, name in enumerate(fit.free) if name not in fit.at_bound]

@@ -18,9 +18,16 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison, gain_beyond
 from psd_deflection.studies.discover.search.fit import Fit, refit, unseen_gap
 from psd_deflection.studies.discover.search.screen import Score, Screen, promising
-
-MOST_TERMS = 20
-"""Terms beyond a limit that are counted at most."""
+from psd_deflection.studies.discover.thresholds import (
+    BIC_GAIN,
+    FEWEST_CASES,
+    LEVELS,
+    LIKELY,
+    MANY_EFFECTS,
+    ROUNDS,
+    TRIALS,
+)
+from psd_deflection.studies.loads.thresholds import MANYFOLD, MINOR, PART
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +51,7 @@ class Terms:
 
 
 def further_terms(
-    screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str], most: int = MOST_TERMS
+    screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str], most: int = LEVELS
 ) -> Terms | None:
     """Return the terms of ``screen`` that pass one by one beside ``fit``, to first order; None if no term passes.
 
@@ -75,29 +82,12 @@ def words_of_terms(workspace: Comparison, fit: Fit, terms: Terms) -> str:
     now = workspace.gap(fit.difference)
     listed = ', '.join(name if n == 1 else f'{n} × {name}' for name, n in Counter(terms.names).items())
     count = len(terms.names)
-    many = f'{MOST_TERMS} or more' if count == MOST_TERMS else f'{count} more'
+    many = f'{LEVELS} or more' if count == LEVELS else f'{count} more'
     return (
         f'{many} term{"" if count == 1 else "s"} ({listed}) would pass one by one, to first order; '
         'on unseen load cases the gap would be '
         f'{workspace.worded(gap)} instead of {workspace.worded(now)}'
     )
-
-
-BIC_ACCEPT = 10.0
-"""Smallest improvement of BIC by an accepted effect."""
-FAR = 10.0
-"""Chi-square per value from which on what remains is screened with signatures beside the effects found so far."""
-STANDS_IN = 0.2
-"""An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
-MANY, FEW_TERMS = 4, 8
-"""Unless so many effects were found, and so few more terms would leave next to nothing on load cases not seen."""
-NEAR = 0.1
-"""Unless it leaves less than this share of the noise itself."""
-MOST_CLOSED = 0.5
-"""A change that leaves less than this share of chi-square beyond noise is worth another look at what else holds."""
-TRIALS = 7
-VALLEYS, DEEPEST = 49, 3
-"""Shapes over their whole ranges at which the loss of a fit is looked at again; from so many it is begun anew."""
 
 
 def key_of(active: ActiveEffect) -> tuple[object, ...]:
@@ -152,7 +142,7 @@ def effect_count(fit: Fit) -> str:
 
 def is_far_off(fit: Fit) -> bool:
     """Return whether ``fit`` leaves so much that small signatures beside it would mislead."""
-    return fit.chi2 > FAR * fit.residual.size
+    return fit.chi2 > MANYFOLD * fit.residual.size
 
 
 def unbound(fit: Fit) -> FloatArray:
@@ -168,7 +158,7 @@ def _shapes(workspace: Comparison, active: ActiveEffect) -> list[dict[str, float
     for p in shapes:
         low, high = p.bounds(workspace.physics, active.values)
         between = np.geomspace if low > 0.0 else np.linspace
-        each = round(VALLEYS ** (1.0 / len(shapes)))
+        each = round(LEVELS ** (1.0 / len(shapes)))
         grids.append([(p.name, float(v)) for v in between(low, high, each + 2)[1:-1]])
     return [dict(shape) for shape in itertools.product(*grids)] if grids else []
 
@@ -268,9 +258,9 @@ class Trials:
                 for shape in _shapes(ws, moved)
             ]
             losses = [ws.loss(ws.residual([*ws.base, *fit.nuisance, *start])[0]) for start in starts]
-            for k in np.argsort(losses)[:DEEPEST].tolist():
+            for k in np.argsort(losses)[:ROUNDS].tolist():
                 best = min(best, refit(ws, starts[k], 12, fit.nuisance), key=self.bic)
-        return best if self.bic(best) < self.bic(fit) - BIC_ACCEPT else fit
+        return best if self.bic(best) < self.bic(fit) - BIC_GAIN else fit
 
     def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
         """Return whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
@@ -279,22 +269,22 @@ class Trials:
             explained = null.residual - smaller.residual
             gain = min(gain, gain_beyond(self.workspace, smaller.residual, larger.residual, explained))
         more = self.penalty * (larger.parameters - smaller.parameters)
-        return gain - more > BIC_ACCEPT
+        return gain - more > BIC_GAIN
 
     def is_substitute(self, smaller: Fit, larger: Fit) -> bool:
         """Return whether what ``larger`` adds only stands in for something that the library lacks."""
         size = self.workspace.size
-        if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
+        if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + MINOR) * size:
             return False
-        small_gain = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
-        return small_gain and not (len(smaller.effects) >= MANY and self._library_explains(smaller))
+        small_gain = larger.chi2 - size > (1.0 - PART) * (smaller.chi2 - size)
+        return small_gain and not (len(smaller.effects) >= MANY_EFFECTS and self._library_explains(smaller))
 
     def _library_explains(self, fit: Fit) -> bool:
         """Whether some more effects beside ``fit`` would leave next to nothing on unseen load cases, to first order."""
-        terms = further_terms(self.screen, fit, self.may_pass, self.workspace.first, FEW_TERMS)
+        terms = further_terms(self.screen, fit, self.may_pass, self.workspace.first, FEWEST_CASES)
         if terms is None:
             return False
-        return unseen_gap(self.workspace, fit, terms.columns) < (1.0 + NEAR) * self.workspace.floor()
+        return unseen_gap(self.workspace, fit, terms.columns) < (1.0 + MINOR) * self.workspace.floor()
 
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""
@@ -335,7 +325,7 @@ class Trials:
 
     def may_pass(self, score: Score) -> bool:
         """Return whether one more effect would pass, to first order."""
-        return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
+        return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_GAIN
 
     def _may_stand_out(self, current: Fit, score: Score) -> bool:
         """Return whether an effect passes at the level that it leaves, to first order: at the level before, chi-square
@@ -350,7 +340,7 @@ class Trials:
     def further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
         """``current`` with the best further effect."""
         # From the second effect on, the residual is smaller and the first guess better.
-        tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
+        tried = promising(scores, self.penalty, LIKELY, TRIALS if not current.effects else 4)
         least = min((s.p for s in scores), default=1.0)
         if least > self.workspace.p_accept and not any(self._may_stand_out(current, s) for s in tried):
             return None

@@ -20,15 +20,19 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut, scatter
 from psd_deflection.studies.discover.search.localise import Dependence, Localisation
 from psd_deflection.studies.discover.search.search import SearchResult
-
-DECADES = 2.0
-"""Range over which the ratio of two independent sizes is spread."""
-ODDS = 20.0
-"""Odds for one cause against independent effects, over all pairs or triples compared. By Markov's inequality,
-independent effects reach odds of N at most once in N searches.
-"""
-EXACT = 0.003
-"""Relative; no ratio is trusted to better, because a stand-in matches the true cause only approximately."""
+from psd_deflection.studies.discover.thresholds import (
+    BANDS,
+    CERTAIN_SD,
+    DECADES,
+    MOST,
+    ODDS,
+    P_CHANCE,
+    P_LIBRARY,
+    P_STRONG,
+    SIGNIFICANT,
+    SURE,
+)
+from psd_deflection.studies.loads.thresholds import DISTINCT_SD, SAME, SIMULATION_ERROR
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ def _amplitudes(fit: Fit, physics: Physics | None, covariance: FloatArray) -> li
             continue
         p = fit.effects[i].effect.parameter(name)
         size = fit.effects[i].values[name] - p.off(physics)
-        clear = abs(size) > 5.0 * math.sqrt(covariance[column, column])
+        clear = abs(size) > CERTAIN_SD * math.sqrt(covariance[column, column])
         if p.kind == 'amplitude' and clear and not fit.effects[i].effect.finite:
             out.append((column, size, p.unit))
     return out
@@ -84,35 +88,12 @@ def _odds(group: Sequence[tuple[int, float, str]], covariance: FloatArray) -> fl
     of_logs = covariance[np.ix_(columns, columns)] / np.outer(sizes, sizes)
     # The logarithm of the first less those of the others.
     less = np.column_stack((np.ones(len(group) - 1), -np.eye(len(group) - 1)))
-    size_covariance = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
+    size_covariance = less @ (of_logs + 0.5 * SIMULATION_ERROR**2 * np.eye(len(group))) @ less.T
     off = less @ np.log(np.abs(sizes))
     density = math.exp(-0.5 * float(off @ np.linalg.solve(size_covariance, off))) / math.sqrt(
         np.linalg.det(2.0 * np.pi * size_covariance)
     )
     return float((DECADES * math.log(10.0)) ** len(off) * density)
-
-
-EQUIVALENT = 21.6
-"""Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
-lambda sin^2(theta/2) = 5.4 one in a hundred would be misnamed, and sin^2(theta) is four times that."""
-EQUIVALENT_BIC = 6.0
-"""An alternative with more parameters must also be this close in BIC, because a more flexible effect always
-fits as well.
-"""
-UNKNOWN_P = 1e-4
-UNKNOWN_EXCESS = 60.0
-FOLLOWS_P = 0.01
-"""Where nobody states a noise, what remains is none if it follows something as clearly as this."""
-MOST_OF_IT = 0.8
-"""The same, by the share of what remains that it makes up: a few readings reach no small p."""
-STEPS_SHARE = 0.02
-"""Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
-SIGNIFICANT = 1.5
-"""A gap of more floors than this never remains without being reported as unknown."""
-BLOCKS_HZ = 25.0
-"""What is faster is in no mean of a block, and so in no gap."""
-ALTERNATIVE_BIC = 10.0
-"""An effect in place of the named one counts as its alternative up to this loss in BIC."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,8 +225,8 @@ def no_noise(workspace: Comparison, residual: Localisation, before: float, after
     """What remains where nobody states a noise, if it follows something or one value is like the next."""
     if not workspace.open_level or np.isfinite(workspace.floor()) or after <= 0.0:
         return ()
-    most = MOST_OF_IT * workspace.size
-    follows = [d for d in residual.dependences if d.p < FOLLOWS_P or d.gain > most][:3]
+    most = MOST * workspace.size
+    follows = [d for d in residual.dependences if d.p < P_CHANCE or d.gain > most][:3]
     if not follows and not workspace.correlated:
         return ()
     names = tuple(dict.fromkeys(d.regressor for d in follows))
@@ -266,13 +247,13 @@ def unknown_of(
     """``gap``: what remains; ``floor``: what noise leaves, ``by_noise``: at most. ``steps``: chi-square that coarse
     steps explain. ``worded``: a gap with its unit.
     """
-    if residual.p > UNKNOWN_P or residual.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
+    if residual.p > P_LIBRARY or residual.excess < max(SURE, SAME * steps):
         return ()
-    fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in residual.cells)
+    fast = any(c.p < P_CHANCE and c.band[0] >= BANDS[4] for c in residual.cells)
     if 0.0 < gap <= max(floor, by_noise) < math.inf and not fast:
         # Noise alone may leave more.
         return ()
-    strong = [d for d in residual.dependences if d.p < 1e-3][:6]
+    strong = [d for d in residual.dependences if d.p < P_STRONG][:6]
     size = _beyond(gap, floor)
     words = _place_of(residual, strong)
     if size > 0.0:
@@ -285,7 +266,9 @@ def unknown_of(
 
 def _place_of(residual: Localisation, strong: Sequence[Dependence]) -> list[str]:
     """On which channels, what it follows and how, and when it is strongest."""
-    channels = list(dict.fromkeys([*(c.channel for c in residual.cells if c.p < 0.01), *(d.channel for d in strong)]))
+    channels = list(
+        dict.fromkeys([*(c.channel for c in residual.cells if c.p < P_CHANCE), *(d.channel for d in strong)])
+    )
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     even = sum(d.gain for d in strong if _even(d.regressor))
     odd = sum(d.gain for d in strong if not _even(d.regressor))
@@ -314,19 +297,13 @@ def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Lo
         f'{", ".join(labels)} and {last} agree in size ({sizes}{unit}) as '
         f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
     )
-    names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
+    names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < P_STRONG))
     share = sum(result.delta_chi2[i] for i, _ in tie.members) / max(result.null.chi2 - fit.chi2, 1e-300)
     return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), unexplained=False),)
 
 
 def _even(regressor: str) -> bool:
     return '^2' in regressor or '|' in regressor or regressor in ('constant', 'dot_x dot_y')
-
-
-SAME = 3.0
-"""Standard deviations of their difference up to which two shares count as the same."""
-CLEAR = 5.0
-"""Standard deviations that a share is away from none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,8 +349,8 @@ def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
     share.
     """
     for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
-        apart = SAME * math.hypot(first.sd, second.sd, EXACT * first.value)
-        clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CLEAR
+        apart = DISTINCT_SD * math.hypot(first.sd, second.sd, SIMULATION_ERROR * first.value)
+        clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CERTAIN_SD
         same = first.moves == second.moves and abs(first.value - second.value) <= apart
         if first.effect != second.effect and same and clear:
             return (_tie(first.value, first.sd, second.value, second.sd, first.moves),)

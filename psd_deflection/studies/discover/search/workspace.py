@@ -29,17 +29,11 @@ from psd_deflection.studies.discover.hidden import (
 )
 from psd_deflection.studies.discover.noise import NoiseModel, corners_of, estimate_noise
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
-from psd_deflection.studies.loads.plate_motion import FINE_SECONDS, dot_rows, fine_means
+from psd_deflection.studies.discover.thresholds import FOLDS, MAX_FINE
+from psd_deflection.studies.loads.plate_motion import dot_rows, fine_means
+from psd_deflection.studies.loads.thresholds import FINE_SECONDS, MINOR, REST_S, SLIGHT
 
-LEAST_NOISE = 0.05
-"""Share of the rig file's noise that is assumed at least."""
-UNSETTLED = 1.1
-"""Free loads are settled beside effects that leave more floors than this."""
-FOLDS = 4
-PIECE_SECONDS = 0.5
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
-MAX_FINE = 60_000
-"""Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
 
 class Workspace(Comparison):
@@ -88,7 +82,7 @@ class Workspace(Comparison):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.acting, o.temperature)
             difference = o.volts - chunk.volts.T
             # Coarse steps hide the noise of a reading that rests.
-            share = 0.25 if any(a.effect.value_grid for a in effects) else LEAST_NOISE
+            share = 0.25 if any(a.effect.value_grid for a in effects) else SLIGHT
             floors = np.maximum(share * o.rig.noises.ravel(), o.rig.converter.volts_per_count / np.sqrt(12.0))
             noise = estimate_noise(o, difference, size, floors)
             present = self._present[i]
@@ -248,7 +242,7 @@ class Workspace(Comparison):
 
     def refitted_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """The same, with what one more of each does beside the ``effects``, if more than noise is left to settle."""
-        if self.free is None or not self.free_loads or self.gap(difference) <= UNSETTLED * self.floor():
+        if self.free is None or not self.free_loads or self.gap(difference) <= (1.0 + MINOR) * self.floor():
             return self
         more = self._implied_loads(self.free, difference)
         return self.with_loads(more).with_free(moved(more), effects)
@@ -313,10 +307,10 @@ class Workspace(Comparison):
         return float(np.sqrt(total / max(count, 1)))
 
     def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Log-likelihood that residual ``b`` gains over ``a`` (D,), in pieces of ``PIECE_SECONDS``."""
+        """Log-likelihood that residual ``b`` gains over ``a`` (D,), in pieces of ``REST_S``."""
         out: list[FloatArray] = []
         for part, o, size in zip(self.split(0.5 * (a * a - b * b)), self.observations, self.fine, strict=True):
-            length = max(1, round(PIECE_SECONDS / (o.period * size)))
+            length = max(1, round(REST_S / (o.period * size)))
             total = part.sum(axis=0)
             out.append(np.add.reduceat(total, np.arange(0, len(total), length)))
         return np.concatenate(out)
