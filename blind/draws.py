@@ -73,24 +73,24 @@ def drawn(seed: int) -> tuple[Drawn, BoolArray, set[str]]:
     # Some move one channel alone.
     alone = (rng.random(p) < 0.3) & (np.arange(channels)[:, None] != rng.integers(channels, size=p))
     terms *= ~alone[:, None, :]
-    seen = np.arange(n + UNSEEN) < n
-    table = terms[:, seen][:, :, true].reshape(channels * n, len(true))
+    shown = np.arange(n + UNSEEN) < n
+    table = terms[:, shown][:, :, true].reshape(channels * n, len(true))
     sizes = np.zeros(p)
     sizes[true] = np.sqrt(np.diag(np.linalg.pinv(table.T @ table))) * rng.uniform(1.0, 10.0, len(true))
     sizes[true] *= rng.choice([-1.0, 1.0], len(true))
     y = terms @ sizes + rng.normal(size=terms.shape[:2])
-    return Drawn(terms, y, bool(rng.integers(2))), seen, {f't{j}' for j in true}
+    return Drawn(terms, y, bool(rng.integers(2))), shown, {f't{j}' for j in true}
 
 
 def duel(seed: int) -> Outcome:
     """One plant, by the three methods."""
-    plant, seen, true = drawn(seed)
-    found = discover_in(Drawn(plant.terms[:, seen], plant.y[:, seen], bool(plant.noise)))
-    ours = plant.y - found.predict(plant)[0]
-    y, observed = plant.y.ravel(), np.tile(seen, len(plant.y))
+    plant, shown, true = drawn(seed)
+    result = discover_in(Drawn(plant.terms[:, shown], plant.y[:, shown], bool(plant.noise)))
+    ours = plant.y - result.predict(plant)[0]
+    y, observed = plant.y.ravel(), np.tile(shown, len(plant.y))
     peers = forward_backward(plant, linear(plant, y), observed), stlsq(plant, y, observed)
-    named = {e.active.effect.name for e in found.effects}
-    errors = rms(ours[:, ~seen]), rms(peers[0][~observed]), rms(peers[1][~observed])
+    named = {e.active.effect.name for e in result.effects}
+    errors = rms(ours[:, ~shown]), rms(peers[0][~observed]), rms(peers[1][~observed])
     return Outcome(seed, len(plant.library), len(true), errors, len(named), len(named - true))
 
 
