@@ -110,8 +110,7 @@ class RimClassifier:
         # It may be one disc's alone, and moves a rim more easily than it bends one.
         wrong = 4.0 * model_error * ROOT_2PI * math.hypot(sharp, motion)
         bent = inverse @ _of_bent_rims(normal, rims) / (pixel_radius * chi_square)
-        bent[:, :6] *= math.hypot(CENTRE_FLOOR, wrong)
-        bent[:, 6:] *= 0.5 * wrong
+        bent *= np.tile(np.repeat((math.hypot(CENTRE_FLOOR, wrong), 0.5 * wrong), (2, 3)), 3)
         # Pixels may be wrong together: along a rim, or along the rows or columns in which a camera is read.
         weighted = residual / np.float32(chi_square)
         line = rims.pixel // self._columns
@@ -229,7 +228,7 @@ def _unevenness(z: Pixels, raw: Pixels, rims: Rims, full_scale: float) -> float:
 def _of_bent_rims(normal: Normal, rims: Rims) -> FloatArray:
     """What rims that are not where the model has them do to the gradient (p, 15), for a shift of the pixel radius.
 
-    Of each disc the shifts by the cosine and sine of the angle around it (columns 0 to 5), by those of twice the angle,
+    Of each disc five columns: the shifts by the cosine and sine of the angle around it, by those of twice the angle,
     which are a tilt, and all around.
     """
     # Some of the pixels are enough for what only widens the covariance.
@@ -247,7 +246,7 @@ def _of_bent_rims(normal: Normal, rims: Rims) -> FloatArray:
     begin = (-(-rims.begin // THINNED)).tolist()
     by_row = np.array([rows[:, a:b] @ around[:, a:b].T for a, b in itertools.pairwise(begin)])
     by_shape = by_row[:, LIGHTS:] - normal.back[:, :, :-1].transpose(0, 2, 1) @ by_row[:, :LIGHTS]
-    return np.hstack([*by_shape[:, :, :2], *by_shape[:, :, 2:]])
+    return np.hstack([*by_shape])
 
 
 def sectors_of(side: tuple[Pixels, Pixels], rims: Rims) -> IntArray:

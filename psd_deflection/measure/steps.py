@@ -91,7 +91,7 @@ def steps_among_samples(dots: FloatArray, width: int) -> list[DotStep]:
             continue
         first, last = a + width, b + width
         moved = _difference(dots, slice(last, last + width), slice(a, first))
-        out.append(DotStep(float(at[a:b] @ weights / weights.sum()), float(np.linalg.norm(moved, axis=0)), first, last))
+        out.append(DotStep(float(at[a:b] @ weights / weights.sum()), float(np.linalg.norm(moved)), first, last))
     return out
 
 

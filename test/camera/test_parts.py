@@ -30,7 +30,7 @@ from psd_deflection.camera.opencv import check_size, checked, declared_size
 from psd_deflection.camera.reference import CameraReference, mean_pose, relative, relative_covariance
 from psd_deflection.camera.refine_corners import refined
 from psd_deflection.camera.rim_classifier import RimClassifier, sectors_of
-from psd_deflection.camera.rim_model import PosePrior, Shape, expected, moved, rotation_matrix
+from psd_deflection.camera.rim_model import PosePrior, Shape, beforehand, expected, moved, rotation_matrix
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.camera.target import target_of
 from psd_deflection.records import FloatArray
@@ -131,6 +131,8 @@ def test_keystone_and_error_of_centres_turn_with_the_target() -> None:
     classifier = RimClassifier(
         cast(Any, SimpleNamespace(focal=1000.0)), 100, np.array([[0.03, 0.0], [0.0, 0.04], [0.0, 0.0]])
     )
+    # Both tilts are known to 0.1 rad.
+    assert beforehand(shape, prior)[0][:2] == pytest.approx(100.0)
     covariance = classifier.moved_centres(shape, 2.0)
     # Two pixels are a millimetre at the target: in its plane, and about its normal.
     in_plane = np.eye(3) - np.outer(rotation[:, 2], rotation[:, 2])
@@ -423,7 +425,7 @@ def test_a_folder_gives_the_middles_of_its_exposures(tmp_path: Path) -> None:
         ('file,t,exposure\na.png,x,0\n', "frames.csv:2: column t holds 'x'"),
         ('file,t,exposure\na.png,0,nan\n', 'column exposure'),
         ('file,t,exposure\na.png,0,-1\n', 'exposure is negative'),
-        ('file,t,exposure\na.png,1,0\nb.png,1,0\n', 'frames.csv:3: t does not increase'),
+        ('file,t,exposure\na.png,0,0\nb.png,1,0\nc.png,1,0\n', 'frames.csv:4: t does not increase'),
         ('file,t,exposure\n../a.png,0,0\n', 'must be the name of an image'),
         ('file,t,exposure\n', 'lists no frame'),
     ],
@@ -477,6 +479,7 @@ def test_the_parameter_file_may_have_any_of_its_forms(tmp_path: Path, text: str)
         ('target.spaceing: 1\n', 'did you mean target.spacing'),
         ('target.spacing: wide\n', 'must be a number'),
         ('target.radius: -1\n', 'must be at least'),
+        ('camera.exposure: -0.5\n', 'must be at least'),
         ('target.radius: 0.02\n', 'more than twice target.radius'),
         ('camera.view: above\n', 'must be one of outside, base'),
         ('camera.matrix: [1, 2]\n', 'must be nine'),

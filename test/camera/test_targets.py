@@ -416,6 +416,16 @@ def test_light_in_waves_fits_no_target(moved: float, right: float, wrong: float)
         assert status_of(replace(circle_settings(scene), rest_frames=1), waves.astype(np.uint8)) is status
 
 
+def test_one_white_pixel_saturates_no_disc() -> None:
+    """The rises are uneven enough for it, but of a thousand pixels one is at full scale."""
+    scene = Scene(blur=1.5)
+    image = photograph(scene, [Pose()], np.random.default_rng(1)).astype(float)
+    white = (image - image.min()) / np.ptp(image)
+    uneven = np.rint(image + 12.0 * (4.0 * white * (1.0 - white)) ** 8).astype(np.uint8)
+    uneven.flat[np.argmin(np.abs(white - 0.9))] = 255
+    assert status_of(replace(circle_settings(scene), rest_frames=1), uneven) is Status.OK
+
+
 def test_two_places_in_one_exposure_are_not_a_motion() -> None:
     image = photograph(Scene(), [Pose(), Pose(dx=1.5e-3)], np.random.default_rng(2))
     assert status_of(circle_settings(Scene()), image) is Status.GHOST

@@ -70,7 +70,8 @@ def test_half_the_light_halves_the_sum_and_doubles_the_noise() -> None:
     noise = RIG.noises.ravel()
     level = np.tile([1.0, -2.0, 5.0], 2)
     volts = level + noise * rng.standard_normal((20_000, 6))
-    half, dark = (lit(RIG, volts, np.full(len(volts), share), rng) for share in (0.5, 0.0))
+    half, dark, full = (lit(RIG, volts, np.full(len(volts), share), rng) for share in (0.5, 0.0, 1.0))
+    np.testing.assert_array_equal(full, volts)
     places, sums = [0, 1, 3, 4], [2, 5]
     np.testing.assert_allclose(half[:, places].std(axis=0), 2.0 * noise[places], rtol=0.03)
     np.testing.assert_allclose(half[:, places].mean(axis=0), level[places], atol=1e-4)

@@ -25,8 +25,6 @@ VERSION = 1
 KEEP_EVERY_S, RESTORE_S = 60.0, 0.1
 END_S = 1.0
 """The end of a run waits so long for the disk."""
-BUSY_S = 5.0
-"""Another program that looks into the file may hold it for so long."""
 ASIDE = '.damaged'
 _TABLES = """
 CREATE TABLE IF NOT EXISTS cells (key INTEGER PRIMARY KEY, cell BLOB NOT NULL);
@@ -86,7 +84,8 @@ class HistoryFile:
     def __init__(self, path: Path, kind: np.dtype[np.void], names: Sequence[str], length: int) -> None:
         self._kind, self._length = kind, length
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None)
+        # Another program that looks into the file may hold it for the 5 s that sqlite3 waits by default.
+        self._file = sqlite3.connect(path, isolation_level=None)
         try:
             self._begin(f'{VERSION} {kind.itemsize} {" ".join(names)}')
         except BaseException:

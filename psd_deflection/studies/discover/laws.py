@@ -328,7 +328,7 @@ def _law_of_the_mean(ws: Workspace, null: Fit, fit: Fit, penalty: float, excess:
     # As of effects: no other case can speak for or against what one case alone shows.
     predicts = _predicts(ws, fit, heldout_gap(ws, fit_with_law, home=False))
     enough = predicts and fit.chi2 - fit_with_law.chi2 > HALF * excess
-    enough &= not _at_changes(ws, best.laws)
+    enough &= not at_load_changes(ws, best.laws)
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_GAIN
     if p > P_CHANCE or bic <= BIC_GAIN or not held.significant or not enough:
         return None
@@ -354,7 +354,7 @@ def _predicts(ws: Workspace, fit: Fit, residual_gap: float) -> bool:
     return residual_gap**2 - floor**2 <= (1.0 - HALF) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
 
 
-def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
+def at_load_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
     """Whether most of the times at which ``laws`` switch are those at which the loads change: the loads do it."""
     times = np.array([t for law in laws for term in law.terms for t in term.times])
     (o, *more) = ws.observations

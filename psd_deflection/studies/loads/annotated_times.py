@@ -135,7 +135,7 @@ class CorrectedNote:
         """It acted so many moments later and, the second number, took so many longer. A moment is a quarter of a
         sample, of which one comes every ``period``, s.
         """
-        later, slower = (*moments, 0.0, 0.0)[:2]
+        later, slower = (*moments, 0.0)[:2]
         moment = 0.25 * period
         return replace(self, applied=self.applied + later * moment, took=max(self.took + slower * moment, 0.0))
 

@@ -172,9 +172,9 @@ def test_a_delay_is_exact_just_after_a_load_step_too(delay: float) -> None:
 
 
 def test_a_running_rig_has_no_early_psd() -> None:
-    rig = with_effects(load_rig(), ['channel_skew,psd=2,delay=-0.0015'], 'test')
+    rig = with_effects(load_rig(), ['channel_skew,psd=2,delay=-0.0015', 'thermal_drift,psd=1,x=1e-4'], 'test')
     simulator, history = RigSimulator(rig), loads.constant((0.0, -5.0, 1.0), 0.05).loads
-    assert simulator.step(history).counts.shape == (50, 6)
+    assert simulator.step(history, np.linspace(20.0, 25.0, 50)).counts.shape == (50, 6)
     with pytest.raises(ConfigError, match='a PSD that is early is simulated with all loads at once'):
         simulator.step(history)
 

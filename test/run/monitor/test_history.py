@@ -190,6 +190,8 @@ def test_memory_is_taken_once_and_marks_are_bounded() -> None:
     made = filled([])
     before = made.bytes
     assert before < 20e6
+    # A day, three days, a week and an hour.
+    assert [ring.length * ring.width_ns / (3600 * SECOND) for ring in made.rings] == [24.0, 72.0, 169.0]
     for k in range(history.MOST_MARKS + 700):
         made.add(row(START_NS + k * 97 * SECOND, 1e-3))
         made.mark(START_NS + k, f'[{k}]')

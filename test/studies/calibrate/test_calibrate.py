@@ -21,7 +21,7 @@ from psd_deflection.studies.calibrate import calibrate as module
 from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
 from psd_deflection.studies.calibrate.dark import dark_levels, result_of_levels, values_of_levels, words_of_level
-from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, prior_of_rig
+from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, fit, prior_of_rig
 from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
 from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows
 from psd_deflection.studies.calibrate.result import values_of
@@ -153,18 +153,26 @@ def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     assert calibration.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
 
 
-def test_a_non_linearity_that_does_not_last_is_dropped(nominal: Rig) -> None:
+def test_a_non_linearity_that_does_not_last_is_dropped(nominal: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the other sign in every second eighth: on what was left out of a fit it is worse than none."""
     pose = misaligned.poses(np.tile(misaligned.pushes(np.random.default_rng(4), 6, 0.1), (8, 1)))
     first, other = (
         misaligned.record(only(psd_1__nonlinearity=k), pose, np.random.default_rng(1), every=10) for k in (2e2, -2e2)
     )
-    odd = np.arange(len(pose))[:, None] * 8 // len(pose) % 2 == 1
+    odd, fits = np.arange(len(pose))[:, None] * 8 // len(pose) % 2 == 1, list[CalibrationFit]()
+
+    def recorded(*given: Any, **also: Any) -> CalibrationFit:
+        fits.append(fit(*given, **also))
+        return fits[-1]
+
+    monkeypatch.setattr(module, 'fit', recorded)
     calibration = calibrate([campaign.run_of(replace(first, volts=np.where(odd, other.volts, first.volts)))], nominal)
+    at = AT['psd_1.nonlinearity']
     assert 'psd_1.nonlinearity' in calibration.dropped
-    assert calibration.values[AT['psd_1.nonlinearity']] == 0.0
-    # It is known better all the same.
-    assert calibration.sd[AT['psd_1.nonlinearity']] < 0.5 * calibration.prior.sd[AT['psd_1.nonlinearity']]
+    assert calibration.values[at] == 0.0
+    # It is known better all the same: as well as the fit knew it, and as far as that was from 0.
+    assert calibration.sd[at] ** 2 == pytest.approx(fits[0].covariance[at, at] + fits[0].values[at] ** 2)
+    assert calibration.sd[at] < 0.5 * calibration.prior.sd[at]
 
 
 def test_a_recording_is_taken_with_its_rig_and_the_load_of_each_sample(tmp_path: Path) -> None:
@@ -221,9 +229,12 @@ def test_a_check_reports_where_the_beams_are_from_the_zero_of_the_file(nominal: 
     pose = misaligned.poses(misaligned.pushes(np.random.default_rng(3), 3, 0.5))
     truth = only(beam_1__x=1.2e-3, beam_1__y=-2.1e-3, beam_2__x=2e-4)
     rig = replace_values(nominal, {'psd_1.zero': [1e-3, -2e-3], 'psd_2.zero': [3e-4, 1e-4]})
-    checkup = check([campaign.run_of(misaligned.record(truth, pose, np.random.default_rng(1)))], rig)
+    checkup, moved = (
+        check([campaign.run_of(misaligned.record(truth | more, pose, np.random.default_rng(1)))], rig)
+        for more in ({}, {'psd_1.rotation': 0.1})
+    )
     off = np.abs(checkup.zero - (2e-4, -1e-4, -1e-4, -1e-4))
-    assert checkup.unchanged
+    assert (checkup.unchanged, moved.unchanged, moved.groups[0].group) == (True, False, 'psd_1.rotation')
     assert np.all((off < 2e-5) & (off < 4.0 * checkup.zero_sd))
 
 

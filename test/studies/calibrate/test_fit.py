@@ -423,7 +423,10 @@ def test_yielding_clamp_is_found_beside_outlier_pose() -> None:
     noise = fitting.Noise(np.array([1e-7, 1e-7, 1e-7]))
     full = fitting.CalibrationFit(np.zeros(SIZE), none, none, linear, weights, noise, np.zeros(SIZE, dtype=bool))
     fit = with_clamp(full, rows, RIG, PRIOR)
-    assert fit.values[fitting.CLAMP_AT : fitting.CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
+    clamp = slice(fitting.CLAMP_AT, fitting.CLAMP_AT + 2)
+    assert fit.values[clamp] == pytest.approx([bends, twists], rel=1e-3)
+    forces = replace(rows, loads=loads * [1.0, 1.0, 0.0])
+    assert with_clamp(full, forces, RIG, PRIOR).free[clamp].tolist() == [True, False]
 
 
 def calibrated(*loads: tuple[float, float, float]) -> CalibrationProgress:
@@ -486,7 +489,9 @@ def test_the_zero_of_a_check_is_in_its_file_by_psd_and_axis() -> None:
 
 def test_rejection_and_covariance_are_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
-    calibration = replace(psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').calibration, rejected='')
+    study = psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml')
+    assert set(study.files()) == {'rig.yaml', 'report.html', 'calibration.json'}
+    calibration = replace(study.calibration, rejected='')
     assert result(calibration, '2026-11-26')['rejected'] is None
     assert result(replace(calibration, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'
     # One parameter is known exactly: it is correlated with nothing.

@@ -48,7 +48,7 @@ def workspace() -> Workspace:
 
 
 def of_setup(name: str) -> Effect:
-    listed = mistakes(2, [0.04, -0.02], [(1, 2, 0.5)])
+    listed = mistakes(2, [0.04, -0.02], [(1, 2, 3e-3)])
     return next(e for e in listed if e.name == name)
 
 
@@ -101,9 +101,10 @@ def test_late_loads_are_those_of_later_and_a_jump_stays() -> None:
     for psd in (1, 2):
         samples = some_samples()
         dots = samples.dots.copy()
-        apply = of_setup('jump').apply
-        assert apply is not None
-        apply(samples, {'psd': psd, 'time_us': 3000.0, 'jump_x': 0.5, 'jump_y': -0.25}, {})
+        jump = of_setup('jump')
+        assert jump.apply is not None
+        where = {p.name: p.nominal for p in jump.parameters}
+        jump.apply(samples, {**where, 'psd': psd, 'jump_x': 0.5, 'jump_y': -0.25}, {})
         change = np.zeros((4, 8))
         change[2 * psd - 2, 3:], change[2 * psd - 1, 3:] = 0.5, -0.25
         np.testing.assert_allclose(samples.dots, dots + change)

@@ -23,6 +23,7 @@ from psd_deflection.studies.discover.discover import discover, effective_loads, 
 from psd_deflection.studies.discover.discover import searched as doubted
 from psd_deflection.studies.discover.hidden import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.problem import Problem
+from psd_deflection.studies.discover.recorded import Recorded, compared
 from psd_deflection.studies.discover.recorded_rig import RecordedRig, rig_of
 from psd_deflection.studies.discover.redundant import FourthReading, excess, visible
 from psd_deflection.studies.discover.report import Discovery
@@ -224,6 +225,16 @@ def held_for_a_second(annotated: FloatArray, more: float) -> Problem:
     o = Observation('x', RIG, volts, np.repeat(annotated, 1000, axis=0))
     machine = RecordedRig.of([o], RIG, effect_names(), None, lambda _: None)
     return Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
+
+
+def test_a_wrong_load_is_found_beside_unannotated_ones() -> None:
+    """Too many loads are off to find the wrong one before the unannotated ones are excluded."""
+    applied = np.concatenate([LEVELS, LEVELS[1:4]])
+    annotated = applied + 5.0 * ((np.arange(11) == 3)[:, None] & (np.arange(3) == 1))
+    annotated[6:] = annotated[5]
+    o = Observation('x', RIG, read(np.repeat(applied, 1000, axis=0)), np.repeat(annotated, 1000, axis=0))
+    recorded, _ = compared(Recorded((o,), RIG, ()))
+    assert ([f.name for f in recorded.findings], [p.number for p in recorded.wrong]) == (['load_coverage'], [3])
 
 
 @pytest.mark.parametrize(('floors', 'other'), [(9.5, False), (10.5, True)])

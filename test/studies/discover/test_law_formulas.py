@@ -149,6 +149,15 @@ def test_times_that_show_are_terms_and_become_better(observed: tuple[Workspace, 
     assert {t.of for t in switchings(answers, ('y1',))} <= {(), ('x1',), ('y1',)}
 
 
+@pytest.mark.parametrize(('times', 'at'), [((4.9, 8.1, 12.0), True), ((4.9, 10.0, 12.0), False), ((5.0, 8.0), False)])
+def test_times_are_those_of_loads_if_most_are(times: tuple[float, ...], at: bool) -> None:
+    """The loads change after 5 s and 8 s; two times are too few."""
+    loads = np.repeat([(0.0, 0.0, 0.0), (0.0, -10.0, 0.0), (5.0, -10.0, 0.0)], (500, 300, 1200), axis=0)
+    o = SimpleNamespace(loads=loads, period=0.01, duration=20.0)
+    law = Law('bump', 'psd', 'y1', (LawTerm('switched', (), times=times),))
+    assert laws.at_load_changes(cast(Workspace, SimpleNamespace(observations=(o,))), [law]) is at
+
+
 @pytest.mark.parametrize('form', ['over', 'under'])
 def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
     (ringing,) = law_features.known_fine(Workspace([make_observation(4)]), (), 'y1')

@@ -167,10 +167,10 @@ def test_pieces_of_a_recording_are_half_seconds(gappy: Workspace) -> None:
 
 
 def test_free_loads_are_those_of_bayesian_least_squares() -> None:
-    """Two loads that overlap, 2 N and 5 N uncertain: noise of covariance I + A S^2 A', sizes by their priors."""
+    """Two loads that overlap, 2 mN and 5 mN uncertain: noise of covariance I + A S^2 A', sizes by their priors."""
     o = make_observation()
     ws = Workspace([o])
-    changes, sd = np.zeros((2, len(o.loads), 3)), np.array([2.0, 5.0])
+    changes, sd = np.zeros((2, len(o.loads), 3)), np.array([2e-3, 5e-3])
     changes[0, 300:700, 1] = changes[1, 500:, 0] = 1.0
     changes[1, 500:, 1] = 0.7
     free = tuple(LoadDirection(0, csc_array(changes[k]), float(sd[k]), 'hung', k) for k in range(2))
