@@ -370,6 +370,7 @@ def test_an_alarm_is_that_of_a_second_reckoning(shift: float) -> None:
     x1, y1 = (page(np.concatenate(dots)[:, i], RIG.acquisition.watch_wander) for i in (0, 1))
     assert alarm is not None
     assert (alarm.channel, alarm.also) == ('y1', ('x1',))
+    assert '; x1 too: ' in alarm.words
     assert (alarm.shift, alarm.sd) == pytest.approx((y1.shift, y1.sd), rel=1e-9)
     assert alarm.since_ns + 20_000_000 == 500_000_000 * y1.since
     assert alarm.observed_ns + 20_000_000 == 500_000_000 * (y1.observed + 1)
