@@ -26,12 +26,13 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.hidden import RIG_NUMBERS, SETUP, only_in
 from psd_deflection.studies.discover.noise import NoiseModel
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.loads.thresholds import MINOR
 
 if TYPE_CHECKING:
     from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
 
-INTERVAL, LEAST_NOISE, COMPETING = 1.96, 0.1, SETUP | {'load_value', 'load_unit'}
-"""Standard deviations; share of the estimated noise that is simulated at least; mistakes that imitate effects."""
+COMPETING = SETUP | {'load_value', 'load_unit'}
+"""Mistakes that imitate effects."""
 
 
 class Named(NamedTuple):
@@ -86,7 +87,7 @@ class Rehearsal:
         matches = [p for o in self.outcomes if (p := self._pairs(o)) is not None]
         pairs = [*itertools.chain(*matches)]
         inside = [
-            abs(b.values[name] - a.values[name]) <= INTERVAL * sd
+            abs(b.values[name] - a.values[name]) <= 1.96 * sd
             for a, b in pairs
             for name, sd in b.sd.items()
             if a.label == b.label and math.isfinite(a.values[name] + b.values[name])
@@ -170,7 +171,7 @@ def _simulated(ws: Workspace, noises: Sequence[NoiseModel], effects: list[Active
         for a in (a for a in effects if a.effect.value_grid):
             steps[[True, True, a.effect.steps_sums(a.values)] * o.psds] = a.values[a.effect.value_grid]
         # The estimated noise contains that of the steps, which the simulation adds.
-        variance = np.maximum(noise.sigma**2 - steps**2 / 12.0, (LEAST_NOISE * noise.sigma) ** 2)
+        variance = np.maximum(noise.sigma**2 - steps**2 / 12.0, (MINOR * noise.sigma) ** 2)
         drawn = dataclasses.replace(noise, sigma=np.sqrt(variance)).draw(len(o.loads), o.period, rng)
         simulator = RigSimulator(o.rig, effects=sort_effects(only_in(effects, i)))
         counts = simulator.step(o.acting, o.temperature, drawn).counts.astype(np.float64)
