@@ -8,6 +8,7 @@ import importlib.util
 import json
 import pickle
 import pydoc
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 import psd_deflection
+from psd_deflection import plants
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError, SolverError
 from psd_deflection.cli.main import main
 from psd_deflection.studies.discover.report import Discovery
@@ -41,6 +43,13 @@ def test_the_import_is_fast_and_brings_nothing_along() -> None:
         {'numpy', 'scipy', 'pandas', 'xarray', 'yaml', 'mcap'}
     )
     assert [name for name in loaded if name.startswith('psd_deflection')] == ['psd_deflection']
+
+
+def test_a_machine_of_a_user_is_made_of_one_module() -> None:
+    """The page's example and the tests' machines import nothing else; the names outlast a move of their rooms."""
+    assert plants.__all__ == ['Effect', 'EffectParameter', 'Model', 'Plant', 'plant_effect']
+    imported = re.findall(r'^from psd_deflection\S* import .*', (ROOT / 'docs/discover.md').read_text(), re.M)
+    assert imported == ['from psd_deflection.plants import EffectParameter, Plant, plant_effect']
 
 
 def test_help_teaches() -> None:

@@ -16,6 +16,7 @@ import pytest
 
 from psd_deflection.base.errors import PsdDeflectionError, RecordingError
 from psd_deflection.base.plugins import optional
+from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.loads import from_csv
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import ReadingsTable, read_references
@@ -173,6 +174,17 @@ def test_a_logger_s_table_follows_its_advice(tmp_path: Path, name: str) -> None:
     samples = open_recording(path).samples
     assert np.allclose(np.diff(samples['t']), 0.01, atol=1e-5)
     assert np.allclose([[float(s[c]) for c in NAMES] for s in samples], [volts(i) for i in range(N)], atol=1e-6)
+
+
+@pytest.mark.parametrize('command', ['replay', 'info', 'discover', 'check', 'identify', 'calibrate'])
+def test_every_command_says_the_unit_of_time(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'a.csv'
+    for name in ('days', 'milliseconds', 'microseconds', 'epoch_ms', 't_us'):
+        content, words = CONVERTIBLE[name]
+        path.write_bytes(content)
+        out = ['--out', str(tmp_path / 'out')] if command in ('discover', 'calibrate') else []
+        assert main([command, str(path), *out]) == 4
+        assert words[-1] in capsys.readouterr().err
 
 
 def split(rows: list[str]) -> bytes:

@@ -277,12 +277,7 @@ def subsets_without_a_term(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
 
 
 def find_law(
-    ws: Workspace,
-    null: Fit,
-    fit: Fit,
-    penalty: float,
-    excess: float,
-    progress: Callable[[str], None],
+    ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, progress: Callable[[str], None]
 ) -> FoundLaw | None:
     """Return the law that explains what ``fit`` leaves, or None.
 

@@ -19,7 +19,7 @@ from psd_deflection.studies.discover.search.fit import Fit, heldout_gain, heldou
 from psd_deflection.studies.discover.search.predictive import predictive_of
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.smooth import Remainder, remainder_of
-from psd_deflection.studies.discover.search.trials import unphysical, wald_chi_square
+from psd_deflection.studies.discover.search.trials import cancels, unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
     Alternative,
     NamedEffect,
@@ -54,12 +54,13 @@ def search(problem: Problem, begun: Fit | None = None) -> Problem:
     search_used, result = problem.search.run(problem.null, begun)
     names = {a.effect.name for a in result.fit.effects}
     if names & start.first and names - start.setup:
-        # A mistake that needs an effect beside it must be much better than effects alone.
+        # A mistake that needs an effect beside it must be much better than effects alone, or the model of fewer.
         plain = search_used.workspace.replaced(first=frozenset())
         plain_search = Search(plain, problem.machine.screen, problem.progress)
         plain_search, plain_result = plain_search.run(refit(plain, ()))
         cost = plain_result.fit.chi2 + plain_search.penalty * plain_result.fit.parameters
-        if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_GAIN:
+        margin = BIC_GAIN if len(plain_result.fit.effects) <= len(result.fit.effects) else 0.0
+        if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + margin:
             search_used, result = plain_search, plain_result
     search_used, result = _with_one_cause(problem, search_used, result)
     if not start.open_level:
@@ -122,6 +123,7 @@ def accepted(problem: Problem) -> Problem:
             if (
                 not gain.significant
                 or unphysical(ws, fit, i)
+                or cancels(ws, fit, i, problem.result.null)
                 or search_used.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
                 or bic <= BIC_GAIN
                 or _in_sds(ws, fit, i) < DISTINCT_SD

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jsonschema
 import numpy as np
@@ -18,10 +18,11 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig, make_active, with_effects
-from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
+from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.plants import Effect, EffectParameter, Model, Plant, plant_effect
 from psd_deflection.recordings.observation import Observation, read_observation
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
@@ -32,8 +33,8 @@ from psd_deflection.rig.parameter_files import read_parameter_file
 from psd_deflection.studies.check.result import NAMES, Finding
 from psd_deflection.studies.discover.cleaning import clean, outliers
 from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.hidden import RIG_NUMBERS
 from psd_deflection.studies.discover.laws import find_jitter, find_law
-from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import SignatureBank, solve_observable
@@ -538,18 +539,52 @@ def found_in(*observations: Observation, full: bool = False) -> Discovery:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('beside', [[], ['sensor_gain,psd=1,x=0.01']])
-def test_a_wrong_length_is_named_alone_and_beside_an_effect(beside: list[str]) -> None:
+@pytest.mark.parametrize(
+    ('seed', 'words'),
+    [
+        (111, ['sensor_rotation,psd=2,angle=0.004', 'creep,amplitude=0.004,time_constant=5']),
+        (112, ['sensor_rotation,psd=2,angle=0.01', 'sensor_gain,psd=1,x=0.01']),
+    ],
+)
+def test_like_numbers_of_unlike_quantities_are_two_effects(seed: int, words: list[str]) -> None:
+    discovery = found_in(observe(with_effects(RIG, words, 'test'), seed))
+    assert sorted(e.name for e in discovery.effects) == sorted(word.split(',')[0] for word in words)
+    assert (discovery.verdict, 'tied' in discovery.sentence) == ('effects_found', False)
+
+
+@pytest.mark.slow
+def test_another_geometry_is_told_in_no_absurd_sizes() -> None:
+    """Of small angles: two PSDs 30 cm away and a link five times as stiff would do the same, nearly."""
+    exact, linear = (ForwardModel(RIG, []).run(share * SET_UP).dots.T / share for share in (1.0, 1e-3))
+    o = recorded(17)
+    o.volts[:, [0, 1, 3, 4]] += (linear - exact) / RIG.amplifier.sensitivity
+    discovery = found_in(o)
+    assert (discovery.verdict, discovery.effects) == ('unknown_effect', ())
+
+
+GAIN, TURNED = ['sensor_gain,psd=1,x=0.01'], ['sensor_rotation,psd=2,angle=0.01']
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('wrong', 'beside'),
+    [
+        *(({'link.length': v}, beside) for v, beside in ((1.02, []), (1.02, GAIN), (0.575 / 0.585, GAIN))),
+        ({'amplifier.sensitivity': 1.02}, GAIN),
+        ({'converter.sample_rate_hz': 0.98}, TURNED),
+        ({'dynamics.bending_frequency': 1.04}, GAIN),
+    ],
+)
+def test_a_wrong_number_is_named_alone_and_beside_an_effect(wrong: dict[str, float], beside: list[str]) -> None:
     """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
-    true = with_effects(replace_values(RIG, {'link.length': 0.585 * 1.02}), beside, 'test')
-    discovery = found_in(observe(true, 3), full=True)
-    assert [effect.name for effect in discovery.effects] == [words.split(',')[0] for words in beside]
-    (mistake,) = discovery.setup
-    assert (mistake.name, mistake.where) == ('link_length', 'link.length')
-    assert mistake.value == pytest.approx(1.02, abs=1e-4)
-    assert mistake.fix.startswith('link.length: 0.596')
+    true = {key: factor * cast(float, RIG.values[key]) for key, factor in wrong.items()}
+    discovery = found_in(observe(with_effects(replace_values(RIG, true), beside, 'test'), 3), full=True)
+    assert [e.name for e in discovery.effects if e.name not in RIG_NUMBERS] == [words.split(',')[0] for words in beside]
+    assert discovery.values == {key: pytest.approx(value, rel=1e-4) for key, value in true.items()}
     assert discovery.floors < 1.05
-    assert 'The set-up is not as' in discovery.sentence
+    of_setup = [f'{key}: ' for key in wrong if key not in RIG_NUMBERS.values()]
+    assert all(f.fix.startswith(key) for f, key in zip(discovery.setup, of_setup, strict=True))
+    assert ('The set-up is not as' in discovery.sentence) is bool(of_setup)
 
 
 @pytest.mark.slow

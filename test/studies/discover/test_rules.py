@@ -390,6 +390,19 @@ def test_an_amplitude_at_its_bound_is_named_only_if_off_there() -> None:
         assert bool(fit.effects) == named
 
 
+@pytest.mark.parametrize(('apart', 'open_level', 'named'), [(0.11, False, 2), (0.09, False, 1), (0.09, True, 2)])
+def test_two_that_take_each_other_back_are_not_both_named(
+    apart: float, open_level: bool, named: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By more than ten times what there is to explain, whatever the effects are."""
+    shown = pictures(A, B)
+    shown[B] = shown[A] + apart * shown[B]
+    plant = Plant(shown, without_noise((shown[B] - shown[A], 1e6)))
+    monkeypatch.setattr(plant, 'open_level', open_level)
+    result = result_of(search := search_of(plant), [active('a', x=0.0), active('b', x=0.0)])
+    assert len(accepted(problem_of(search, result)).fit.effects) == named
+
+
 def test_weakest_effect_goes_first_then_reweighed() -> None:
     shown = pictures(A, B)
     # Two pictures nearly the same: with the other present, each seems to explain nothing.

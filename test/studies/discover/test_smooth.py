@@ -16,10 +16,10 @@ from scipy.linalg import null_space
 from scipy.stats import multivariate_normal, ttest_1samp
 
 import psd_deflection
-from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.plants import EffectParameter, Model, Plant, plant_effect
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plant_search import PlantComparison, PlantDiscovery
-from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.search import predictive
 from psd_deflection.studies.discover.search import smooth as smoothing
 from psd_deflection.studies.discover.search.fit import refit

@@ -13,6 +13,7 @@ import pytest
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
+from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
@@ -246,7 +247,7 @@ def test_noise_beside_large_effect_hides_no_small_one() -> None:
     assert cast(Rough, search.workspace).estimates >= 2
 
 
-def test_the_better_of_two_alike_stays_the_other_is_listed() -> None:
+def test_the_better_of_two_alike_stays_the_other_is_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = pictures(A, B)
     shown[B] = shown[A] + 0.3 * across(shown[B], shown[A])
     plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
@@ -266,6 +267,9 @@ def test_the_better_of_two_alike_stays_the_other_is_listed() -> None:
     assert search.library_p(9.0, 1) == pytest.approx(1.0 - (1.0 - chi2_law.sf(9.0, 1)) ** 2)
     assert search.library_p(-1.0, 1) == 1.0
     assert search.penalty == pytest.approx(math.log(size * 4 / 20))
+    # However much is spent.
+    monkeypatch.setattr(plant, 'budget', 0)
+    assert [named(f) for f in search.alternatives(null, worse, 0, null.chi2 - worse.chi2)] == [['a']]
 
 
 EDGES = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
@@ -384,9 +388,9 @@ def test_only_like_sizes_of_two_effects_are_compared() -> None:
     ((tie),) = coincidences(amplitudes(*two), physics)
     assert (tie.members, tie.sizes, tie.unit) == (((0, 'x'), (1, 'y')), (0.5, 0.5), 'V')
     assert coincidences(amplitudes(*two, same=True), physics) == []
-    assert coincidences(amplitudes(('x', 'V', 0.5), ('y', 'm', 0.5)), physics) == []
-    # An angle and a share are unlike quantities.
-    assert coincidences(amplitudes(('x', 'rad', 0.5), ('y', '', 0.5)), physics) == []
+    # Of unlike quantities, an angle and a share among them, the numbers may be alike.
+    for a, b in itertools.combinations({p.unit for e in catalogue().values() for p in e.parameters}, 2):
+        assert coincidences(amplitudes(('x', a, 0.5), ('y', b, 0.5)), physics) == []
     # Five deviations from nothing, or it has no size; and what a step does at once has none.
     for size, pairs in ((0.0049, 1), (0.0051, 3)):
         (first,) = coincidences(amplitudes(*two, ('z', 'V', size)), physics)

@@ -146,7 +146,10 @@ def test_lost_samples_change_no_time() -> None:
 
 @pytest.mark.parametrize(
     ('late', 'names'),
-    [((0.4,) * 6, ['load_ramp'] * 6), ((0.0, 2.0, 0.0, 0.0, 0.0, 0.0), ['load_ramp', 'load_time', *['load_ramp'] * 4])],
+    [
+        *(((late,) * 6, ['load_ramp'] * 6) for late in (0.0, 0.4)),
+        ((0.0, 2.0, 0.0, 0.0, 0.0, 0.0), ['load_ramp', 'load_time', *['load_ramp'] * 4]),
+    ],
 )
 def test_slow_load_annotated_as_step_is_a_ramp(late: tuple[float, ...], names: list[str]) -> None:
     correction = corrected(volts(applied(0.8)), annotated(late))

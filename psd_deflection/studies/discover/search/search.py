@@ -356,9 +356,11 @@ class Search(Trials):
             same = {current.free[j][0] for j, part in zip(keep, parts, strict=True) if part > MINOR * size}
             if any(current.effects[i].effect.name in self.workspace.setup for i in same):
                 continue
-            rest = [a for i, a in enumerate(current.effects) if i not in same]
             start = candidate.from_coefficients(np.array([0.0]))
-            best = min(best, refit(self.workspace, [*rest, start], iterations=12), key=self.bic)
+            # All of them, or all but what is there besides.
+            for gone in (same, *({i} for i in same)):
+                rest = [a for i, a in enumerate(current.effects) if i not in gone]
+                best = min(best, refit(self.workspace, [*rest, start], iterations=12), key=self.bic)
         if self.bic(best) > self.bic(current) - 0.5 * BIC_GAIN:
             return current
         self.log('one cause: ' + ', '.join(a.label for a in best.effects))

@@ -118,6 +118,18 @@ def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
     return not on
 
 
+def cancels(workspace: Comparison, fit: Fit, index: int, null: Fit) -> bool:
+    """Return whether others take back most of what effect ``index`` does, ten times what ``null`` leaves: such sizes
+    are absurd; together they stand in for what the library lacks.
+    """
+    effect, values = fit.effects[index].effect, fit.effects[index].values
+    if workspace.open_level or effect.finite:
+        return False
+    sizes = [(j, effect.parameter(fit.free[j][1])) for j in fit.columns_of(index)]
+    does = [fit.jacobian[:, j] * (values[p.name] - p.off(workspace.physics)) for j, p in sizes if p.kind == 'amplitude']
+    return bool(np.sum(np.sum(does, axis=0) ** 2) > MANYFOLD**2 * null.chi2)
+
+
 def wald_chi_square(workspace: Comparison, fit: Fit, index: int) -> float:
     """Chi-square by which the size of effect ``index`` of ``fit`` is another than none, by its own covariance.
 
