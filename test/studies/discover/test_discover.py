@@ -562,7 +562,7 @@ def test_another_geometry_is_told_in_no_absurd_sizes() -> None:
     assert (discovery.verdict, discovery.effects) == ('unknown_effect', ())
 
 
-GAIN, TURNED = ['sensor_gain,psd=1,x=0.01'], ['sensor_rotation,psd=2,angle=0.01']
+GAIN, ROTATED = ['sensor_gain,psd=1,x=0.01'], ['sensor_rotation,psd=2,angle=0.01']
 
 
 @pytest.mark.slow
@@ -571,7 +571,7 @@ GAIN, TURNED = ['sensor_gain,psd=1,x=0.01'], ['sensor_rotation,psd=2,angle=0.01'
     [
         *(({'link.length': v}, beside) for v, beside in ((1.02, []), (1.02, GAIN), (0.575 / 0.585, GAIN))),
         ({'amplifier.sensitivity': 1.02}, GAIN),
-        ({'converter.sample_rate_hz': 0.98}, TURNED),
+        ({'converter.sample_rate_hz': 0.98}, ROTATED),
         ({'dynamics.bending_frequency': 1.04}, GAIN),
     ],
 )
