@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inputs of discover that are tables of readings: a link at rest, as a plant."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.from_recordings import entries
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.plants import Readings, ReadingsPlant, Resting, resting_in, resting_rows
+from psd_deflection.studies.loads.thresholds import PART, SEVERAL
 from psd_deflection.studies.study import Notify
 
 
@@ -120,8 +121,27 @@ def read_tables(
     ]
 
 
+def stuck_readings(plant: ReadingsPlant) -> Iterator[str]:
+    """Readings that are the same to the last digit under several loads which differ by a fifth of what moves them."""
+    for table, measured, simulated in zip(plant.tables, plant.measured(), plant.simulate({}), strict=True):
+        for channel, every, moves in zip(plant.channels, measured, simulated, strict=True):
+            rows = np.flatnonzero(np.isfinite(every))
+            for run in np.split(rows, np.flatnonzero(np.diff(every[rows])) + 1):
+                if SEVERAL <= len(run) < len(rows) and np.ptp(moves[run]) > PART * np.ptp(moves):
+                    first, last = run[[0, -1]] + 1
+                    yield (
+                        f'{table.name}: {channel} is the same in rows {first} to {last} under different loads: '
+                        'something stopped the link, or the reading is stuck; empty cells are left out'
+                    )
+
+
 def discovered(
     tables: Sequence[Readings], without: tuple[str, ...], params_file: str | Path | None, warn: Notify, seed: int
 ) -> PlantDiscovery:
-    """Return what the simulation lacks to explain ``tables``; ``warn`` is told if the rig file cannot be edited."""
-    return discover_in(ReadingsPlant(tables, without, params_file, warn), seed=seed)
+    """Return what the simulation lacks to explain ``tables``; ``warn`` is told if the rig file cannot be edited, and of
+    readings that are stuck.
+    """
+    plant = ReadingsPlant(tables, without, params_file, warn)
+    for words in stuck_readings(plant):
+        warn(words)
+    return discover_in(plant, seed=seed)

@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.noise import SlowNoise
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.plants import CHANNELS, Plant, Readings, ReadingsPlant
-from psd_deflection.studies.discover.readings import read_tables
+from psd_deflection.studies.discover.readings import discovered, read_tables
 from psd_deflection.studies.discover.redundant import fourth, fourth_reading
 from psd_deflection.studies.discover.rehearsal import simulated_recordings
 from psd_deflection.studies.discover.search.fit import refit
@@ -233,16 +233,22 @@ def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('rest', ['0', ''])
-def test_dial_gauge_is_searched_beside_empty_columns(tmp_path: Path, rest: str) -> None:
+@pytest.mark.parametrize('axis', range(3))
+@pytest.mark.parametrize('rest', ['0', '', '0.0005'])
+def test_a_gauge_is_searched_beside_constant_columns(tmp_path: Path, rest: str, axis: int) -> None:
     """Readings that are exactly as simulated are no measurement; nothing is held against them."""
-    masses = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
-    rows = [f'{m},{rest},{min(-31.6e-3 * m, 0.0) if m < 1.4 else -31.6e-3 * 1.2:.6f},{rest}' for m in masses]
-    (tmp_path / 'beam.csv').write_text('\n'.join(['mass,ref_dx,ref_dy,ref_theta', *rows]) + '\n')
-    discovery = discover_in(ReadingsPlant(read_tables([tmp_path / 'beam.csv'])))
+    lines = ['load_fx,load_fy,load_tz,ref_dx,ref_dy,ref_theta']
+    for mass in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6):
+        load, cells = ['0'] * 3, [rest] * 3
+        load[axis], cells[axis] = f'{-9.81 * mass}', f'{-31.6e-3 * min(mass, 1.2):.6f}'
+        lines.append(','.join([*load, *cells]))
+    (tmp_path / 'beam.csv').write_text('\n'.join(lines) + '\n')
+    channel, told = ('ref_dx', 'ref_dy', 'ref_theta')[axis], list[str]()
+    discovery = discovered(read_tables([tmp_path / 'beam.csv']), (), None, told.append, 0)
+    assert [f'{channel} is the same in rows 7 to 9 under different loads' in words for words in told] == [True]
     assert discovery.verdict in ('effects_found', 'unknown_effect')
     assert 0.0 < discovery.gap_before < 0.1 * 1e6
-    assert discovery.per_channel['ref_dx'][0] == 0.0
+    assert [gaps[0] > 0.0 for gaps in discovery.per_channel.values()] == [i == axis or rest > '0' for i in range(3)]
 
 
 TABLE_LOADS = np.array(

@@ -9,6 +9,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -173,6 +174,19 @@ def test_shared_sizes_leave_the_likelihood_once() -> None:
     steps = 1e-5 * np.eye(6).reshape(6, 2, 3)
     numeric = [(exact(second + h) - exact(second - h)) / 2e-5 for h in steps]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_sixty_parts_and_eight_inputs_take_few_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What takes the time is counted."""
+    rng, asked, names = np.random.default_rng(1), itertools.count(), [f'u{i}' for i in range(8)]
+    u, likelihood = rng.uniform(-1.0, 1.0, (60, 8)), smoothing.negative_log_likelihood
+    y = np.column_stack([2.0 * u[:, 0] - u[:, 1] + np.sin(6.0 * u[:, 2]), u @ rng.standard_normal(8)])
+    rows = np.column_stack([u, y + 0.05 * rng.standard_normal((60, 2)), np.arange(60)])
+    np.savetxt(tmp_path / 'a.csv', rows, delimiter=',', header=','.join([*names, 'y', 'z', 'part']), comments='')
+    monkeypatch.setattr(smoothing, 'negative_log_likelihood', lambda *a, **k: (next(asked), likelihood(*a, **k))[1])
+    answer = psd_deflection.discover_in(tmp_path / 'a.csv', inputs=names, outputs=['y', 'z'], parts='part')
+    assert (answer.simulations < 20_000, 0 < next(asked) < 6000) == (True, True)
 
 
 TERMS = 30

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import fdtri
 
 from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY, ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
@@ -24,7 +25,6 @@ from psd_deflection.studies.discover.thresholds import (
     BANDS,
     CERTAIN_SD,
     DECADES,
-    MOST,
     ODDS,
     P_CHANCE,
     P_LIBRARY,
@@ -225,8 +225,10 @@ def no_noise(workspace: Comparison, residual: Localisation, before: float, after
     """What remains where nobody states a noise, if it follows something or one value is like the next."""
     if not workspace.open_level or np.isfinite(workspace.floor()) or after <= 0.0:
         return ()
-    most = MOST * workspace.size
-    follows = [d for d in residual.dependences if d.p < P_CHANCE or d.gain > most][:3]
+    # Of few values even all are a small chi-square: Fisher's F of a channel, over all that was tried.
+    n = workspace.size / max(len({c.channel for c in residual.cells}), 1)
+    least = n / (1.0 + (n - 1.0) / fdtri(1.0, n - 1.0, 1.0 - P_CHANCE / max(len(residual.dependences), 1)))
+    follows = [d for d in residual.dependences if d.p < P_CHANCE or d.gain > least][:3]
     if not follows and not workspace.correlated:
         return ()
     names = tuple(dict.fromkeys(d.regressor for d in follows))
