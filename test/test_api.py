@@ -46,7 +46,6 @@ def test_the_import_is_fast_and_brings_nothing_along() -> None:
 
 
 def test_a_machine_of_a_user_is_made_of_one_module() -> None:
-    """The page's example and the tests' machines import nothing else; the names outlast a move of their rooms."""
     assert plants.__all__ == ['Effect', 'EffectParameter', 'Model', 'Plant', 'plant_effect']
     imported = re.findall(r'^from psd_deflection\S* import .*', (ROOT / 'docs/discover.md').read_text(), re.M)
     assert imported == ['from psd_deflection.plants import EffectParameter, Plant, plant_effect']

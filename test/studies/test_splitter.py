@@ -38,8 +38,7 @@ def test_the_numbers_of_the_rules() -> None:
     both, first, second, share, _, _, spare = rules(RIG, Lasers((0.6e-3, 0.4e-3), 1e-3))
     assert (both.value, both.limit) == pytest.approx((1e-3, 2e-3))
     assert (first.value, second.value, first.limit) == pytest.approx((3.0, 2.0, 1.25))
-    assert share.value == pytest.approx(0.4)
-    assert spare.value == pytest.approx(5.0 / 1.5)
+    assert (share.value, spare.value) == pytest.approx((0.4, 5.0 / 1.5))
 
 
 def test_failed_laser_costs_certainty_or_warm_up() -> None:

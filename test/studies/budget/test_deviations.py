@@ -122,8 +122,7 @@ def test_air_bends_both_beams_alike_or_each() -> None:
     values = np.array([[1.0, 2.0, 10.0, 20.0, 30.0, 40.0], [0.0] * 6])
     once = _term('refraction').apply(at.chain, values, at)
     assert once.beam_shift.tolist() == [[[11.0, 22.0], [31.0, 42.0]], [[0.0, 0.0], [0.0, 0.0]]]
-    twice = _term('refraction').apply(once, values, at)
-    assert np.array_equal(twice.beam_shift, 2.0 * once.beam_shift)
+    assert np.array_equal(_term('refraction').apply(once, values, at).beam_shift, 2.0 * once.beam_shift)
 
 
 def test_what_the_other_terms_change() -> None:
@@ -134,8 +133,7 @@ def test_what_the_other_terms_change() -> None:
         np.array([[[1e-5, 8e-5], [-1.1e-4, 2e-5]], [[-2e-5, -1.6e-4], [2.2e-4, -4e-5]]])
     )
     assert BRACKET_EXPANSION.apply(grown, np.array([[1e-3]]), at).center_shift[0, 1, 0] == pytest.approx(-2.2e-4)
-    ratio = SLOPE_RATIO.apply(at.chain, np.array([[0.2], [-0.3]]), at)
-    assert ratio.slope_ratio == pytest.approx([1.7, 1.2])
+    assert SLOPE_RATIO.apply(at.chain, np.array([[0.2], [-0.3]]), at).slope_ratio == pytest.approx([1.7, 1.2])
     # The flat method takes k as 0; the tilt is there or not.
     assert PLANE_TILT.apply(at.chain, np.array([[0.0], [1.0]]), at).slope_ratio == pytest.approx([0.0, 1.5])
     beam = _at('beam')
@@ -263,8 +261,7 @@ def test_draws_are_of_all_causes_together() -> None:
     both = [_term('amplifier_noise'), _term('pointing_drift')]
     observed: list[int] = []
     errors = draws(at, 25_000, 5, both, observed.append)
-    assert observed == [10_000, 10_000, 5_000]
-    assert errors.shape == (25_000, 3)
+    assert (observed, errors.shape) == ([10_000, 10_000, 5_000], (25_000, 3))
     total = np.sqrt(sum(np.diag(c.contribution(at).covariance) for c in both))
     assert errors.std(axis=0) == pytest.approx(total, rel=0.02)
     assert np.abs(errors.mean(axis=0) / total).max() < 5.0 / math.sqrt(25_000)

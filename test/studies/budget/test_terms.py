@@ -237,8 +237,7 @@ def test_the_estimators_give_the_golden_answers(name: str, method: str, key: str
     readings, zeros = np.array([case['readings']]), np.array([case['m0']])
     # The linear method's A is of the beams, so the rig must know its zeros.
     rig = replace_values(rig, {'psd_1.zero': case['m0'][0], 'psd_2.zero': case['m0'][1]})
-    got = estimator_of(rig, method).estimate(readings, zeros)[0]
-    assert got == pytest.approx(case[key], abs=1e-10)
+    assert estimator_of(rig, method).estimate(readings, zeros)[0] == pytest.approx(case[key], abs=1e-10)
 
 
 def test_a_method_that_there_is_not_and_a_rig_that_sees_no_twist() -> None:
@@ -396,8 +395,7 @@ def test_effective_freedom_is_that_of_the_gum() -> None:
     # A known deviation adds to the numerator alone; all known: infinite; never below 1.
     assert evaluation.effective_freedom([1.0, 1.0], [3.0, math.inf]) == 12.0
     assert evaluation.effective_freedom([1.0, 2.0], [math.inf, math.inf]) == math.inf
-    assert evaluation.effective_freedom([0.0], [5.0]) == math.inf
-    assert evaluation.effective_freedom([1.0], [0.5]) == 1.0
+    assert (evaluation.effective_freedom([0.0], [5.0]), evaluation.effective_freedom([1.0], [0.5])) == (math.inf, 1.0)
 
 
 def test_a_bias_that_is_not_corrected_is_added_with_its_size() -> None:
@@ -440,8 +438,7 @@ def test_a_deviation_that_is_hardly_known_is_drawn_wider() -> None:
 def test_u_is_half_of_the_drawn_interval() -> None:
     answer = budget(BudgetProblem(RIG, draws=20_000))
     assert answer.interval is not None
-    message = answer.budget.expanded()
-    assert np.abs(evaluation.difference(message, answer.interval)).max() < 0.06
+    assert np.abs(evaluation.difference(answer.budget.expanded(), answer.interval)).max() < 0.06
     errors = evaluation.draws(answer.budget.at, 20_000, 1, shaped=True)
     inside = np.abs(errors - answer.interval.middle) <= answer.interval.half
     assert inside.mean(axis=0) == pytest.approx(0.95, abs=1e-4)

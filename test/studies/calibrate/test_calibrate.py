@@ -353,8 +353,7 @@ def test_lasers_may_be_off_one_after_the_other_and_for_a_part(nominal: Rig) -> N
     (level, two) = dark_levels([run_of(first, 'a'), run_of(second, 'b')], nominal)
     assert (level.recording, level.seconds) == ('a', 5.0)
     assert (two.recording, two.seconds) == ('b', 4.1)
-    assert level.volts[2] == pytest.approx(0.12, abs=1e-3)
-    assert two.volts[2] == pytest.approx(0.06, abs=1e-3)
+    assert (level.volts[2], two.volts[2]) == pytest.approx((0.12, 0.06), abs=1e-3)
 
 
 def test_lost_samples_are_left_out(nominal: Rig) -> None:

@@ -91,8 +91,7 @@ def test_a_turn_the_other_way_is_reported_beside_exchanged_psds() -> None:
     x, y, rotation = hand_of(known, 0.2e-3, 0.1)
     guide, _ = led(known, Bench(known, 1), (x, y, -rotation))
     checkup = verdict(known, guide)
-    assert [f.name for f in checkup.findings] == ['psd_swap']
-    assert checkup.findings[0].equivalent == ('load_sign of tz',)
+    assert ([f.name for f in checkup.findings], checkup.findings[0].equivalent) == (['psd_swap'], ('load_sign of tz',))
 
 
 MICRO = 1e-6
@@ -165,8 +164,7 @@ def test_rest_takes_2_s_and_push_and_release_0_6_s() -> None:
         assert len(guide.pushes) == number
     assert fed.at(Phase.DONE)
     assert (guide.number, guide.prompt()) == (3, 'Done.')
-    assert fed.feed(FAR) == ['']
-    assert [p.loads for p in guide.pushes] == [('fx',), ('fy',), ('tz',)]
+    assert (fed.feed(FAR), [p.loads for p in guide.pushes]) == ([''], [('fx',), ('fy',), ('tz',)])
     assert [p.only_twist for p in guide.pushes] == [False, False, True]
     assert not any(p.sized for p in guide.pushes)
     assert [p.expected.tolist() for p in guide.pushes] == [[-1, 0, -1, 0], [0, -1, 0, -1], [0.07, 0, 0, 0.1]]
@@ -294,8 +292,7 @@ def test_a_push_is_relative_to_the_rests_around_it() -> None:
     drift, sd = fed.guide.drift()
     assert drift == pytest.approx(np.array([4e-6, 0.0, 0.0, -6e-6]) / 2.4)
     assert sd == pytest.approx((np.array([rest, 1e-6, rest, rest]) + 2e-6) / 2.4)
-    assert fed.guide.rest().shape == (2000, 6)
-    assert fed.guide.rest()[:, 2].tolist() == [5.0] * 2000
+    assert (fed.guide.rest().shape, fed.guide.rest()[:, 2].tolist()) == ((2000, 6), [5.0] * 2000)
 
 
 def test_a_push_at_the_end_of_the_range_is_filled_and_no_more() -> None:
@@ -326,8 +323,7 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     shown: list[float] = []
     world = load_rig(overrides={'psd_1.axes': ['-y', 'x'], 'psds_exchanged': True})
     checkup = run_guided(load_rig(), world, texts(logged.append), lambda guide: shown.append(guide.progress))
-    assert checkup.verdict == WRONG
-    assert dict(checkup.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
+    assert (checkup.verdict, dict(checkup.values)) == (WRONG, {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']})
     prompts = [text[:12] for text in logged if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
     assert prompts == ['Leave the li', '1 of 3: Push', 'Let go.', '2 of 3: Push', 'Let go.', '3 of 3: Turn', 'Let go.']
     assert max(shown) > 0.9

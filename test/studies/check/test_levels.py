@@ -165,8 +165,7 @@ def test_loads_that_came_together_are_reported_at_their_largest() -> None:
     for most, more, way in (((0, -4, -2), (0, -3.9, -2.2), -1.0), ((0, -4, 2), (0, -3.9, 2.2), -1.0)):
         loads = held((0, 0, 0), more, most, (0, -2, 0.5 * most[2]), (0, 0, 0))
         (push,) = responses(RIG, of_loads(RIG, loads), loads).pushes
-        assert push.loads == ('fy', 'tz')
-        assert push.name == '+Y with +θ'
+        assert (push.loads, push.name) == (('fy', 'tz'), '+Y with +θ')
         # The first that is named says where it is largest, and its way.
         assert push.expected == pytest.approx(way * at_rest(RIG, most), abs=1e-9)
         assert push.channels == pytest.approx(push.expected, abs=1e-7)
@@ -384,8 +383,7 @@ def test_channel_below_a_tenth_of_every_push_is_dead() -> None:
 def test_stuck_channel_is_reported_once_without_wiring() -> None:
     dead = replace(push_of('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
     checkup = checked([dead, push_of('fy')], of_levels(stuck=('x1', 'sum2')))
-    assert of(checkup) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
-    assert checkup.verdict == WRONG
+    assert (of(checkup), checkup.verdict) == ([('stuck_channel', 'x1'), ('stuck_channel', 'sum2')], WRONG)
     rotated = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push_of(load, 9.80665, rotated) for load in ('fx', 'fy', 'tz')]
     assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
@@ -395,8 +393,7 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     wiring = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push_of(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')]
     checkup = checked(three)
-    assert of(checkup) == [('channel_sign', 'x1')]
-    assert dict(checkup.values) == {'psd_1.axes': ['-x', 'y']}
+    assert (of(checkup), dict(checkup.values)) == ([('channel_sign', 'x1')], {'psd_1.axes': ['-x', 'y']})
     # By the file a push along X is opposite on x1, which leaves all of it; one turn is opposite, too.
     assert checkup.findings[0].evidence == pytest.approx(1.0 + 1.0 - 0.0, abs=0.7)
     assert checkup.findings[0].evidence > 1.0
@@ -489,8 +486,7 @@ def test_pushes_that_no_wiring_explains_are_asked_for_again() -> None:
     odd = [replace(push_of('fx'), channels=np.array([-1.0, 1.0, 1.0, 1.0]) * 1e-4), push_of('fy'), push_of('tz')]
     odd[0] = replace(odd[0], channels=np.array([-1.0, 1.0, -1.0, 1.0]) * 1e-4)
     checkup = checked(odd)
-    assert checkup.wirings == ()
-    assert checkup.verdict == CANNOT_TELL
+    assert (checkup.wirings, checkup.verdict) == ((), CANNOT_TELL)
     assert [(f.where, f.fix) for f in checkup.findings] == [
         ('fx fy tz', 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ')
     ]
@@ -515,8 +511,7 @@ def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:
     assert checked(pushes, of_levels(noise), rig=rig).findings == ()
     noise[4] = 9e-3
     checkup = checked(pushes, of_levels(noise), rig=rig)
-    assert of(checkup) == [('noise_level', 'x1')]
-    assert dict(checkup.values) == {'psd_1.noise': [9e-3, 2e-3]}
+    assert (of(checkup), dict(checkup.values)) == ([('noise_level', 'x1')], {'psd_1.noise': [9e-3, 2e-3]})
 
 
 @pytest.mark.parametrize(
@@ -539,8 +534,7 @@ def test_a_sum_between_its_limits_is_light_enough(sums: tuple[float, float], lig
     other = [push_of(load, 1.0, Wiring(exchanged=True)) for load in ('fx', 'fy', 'tz')]
     assert {f'psd_{3 - int(psd[-1])}' for psd in checked(other, of_levels(sums=sums), rig=rig).light} == {*light}
     # One that is stuck is told already.
-    dead = checked(levels=of_levels(sums=sums, stuck=('sum1', 'sum2')))
-    assert not dead.light
+    assert not checked(levels=of_levels(sums=sums, stuck=('sum1', 'sum2'))).light
 
 
 @pytest.mark.parametrize(

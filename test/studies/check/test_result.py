@@ -192,8 +192,7 @@ def test_a_load_noted_within_a_tenth_of_a_second_is_no_mistake() -> None:
 
 def test_the_tree_and_the_table_have_all_numbers() -> None:
     wrong = replace(CHECKUP, verdict=WRONG, findings=(finding('channel_sign', 'x1', 'turn', ('a',)),), source='run.csv')
-    assert wrong.sources == {'recording': 'run.csv'}
-    assert CHECKUP.sources == {}
+    assert (wrong.sources, CHECKUP.sources) == ({'recording': 'run.csv'}, {})
     tree = wrong.tree()
     assert tree['setup'] == [finding_tree(wrong.findings[0])]
     assert tree['setup'] == [

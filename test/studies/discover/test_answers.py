@@ -187,8 +187,7 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
         assert np.isnan(late.observations[0].volts[:, 0]).sum() == excluded
     # The link follows its loads as simulated: nothing is late.
     assert likely_delays(Workspace([o])) == []
-    short = Workspace([make_observation()])
-    assert likely_delays(short) == []
+    assert likely_delays(Workspace([make_observation()])) == []
     part = 0.01 * np.random.default_rng(0).standard_normal((6, 300))
     part[4, 120:] += 2.0
     part[3, 120:] -= 1.0
@@ -221,8 +220,7 @@ def test_a_candidate_has_its_choices_and_shapes_fixed() -> None:
         (way, f, 0.5, ('size',)) for way in (0.0, 1.0) for f in (2.0, 50.0)
     ]
     assert [c.variant for c in got] == [('made_up', way) for way in (0.0, 0.0, 1.0, 1.0)]
-    assert len({c.key for c in got}) == 4
-    assert [c.off['size'] for c in got] == [0.5] * 4
+    assert (len({c.key for c in got}), [c.off['size'] for c in got]) == (4, [0.5] * 4)
     # Peaks of the residual's spectrum besides the grid; lines instead of it.
     ways: tuple[tuple[Proposal, list[float]], ...] = (('spectral', [7.0, 2.0, 50.0]), ('line', [9.0]))
     for propose, wanted in ways:
@@ -444,8 +442,7 @@ def test_what_remains_is_reported_in_words() -> None:
         'on y2, x2; 4 µm rms (1.7 times the noise remain); follows load_fx; mostly odd; '
         'strongest at 1.0 to 2.5 s, 9 to 17 Hz'
     )
-    assert u.rms == pytest.approx(4e-6)
-    assert u.explains == pytest.approx(0.25)
+    assert (u.rms, u.explains) == pytest.approx((4e-6, 0.25))
     many = tuple(Dependence('x2', f'load_{i}', 10.0, 1e-9) for i in range(9))
     (u,) = unknown_of(left_with(dependences=many), 0.0)
     assert u.depends_on == tuple(f'load_{i}' for i in range(6))
@@ -470,8 +467,7 @@ def test_a_gap_that_remains_is_never_left_unreported() -> None:
     assert weighing.unnamed_gap(noise, 9e-6, 1.5e-6) == ()
     (u,) = weighing.unnamed_gap(noise, 3e-6, 1.6e-6)
     assert u.signature == '1.25 µm remain, 1.6 times the noise, in no single place or band'
-    assert u.rms == pytest.approx(math.sqrt(1.56) * 1e-6)
-    assert u.explains == pytest.approx((1.6 / 3) ** 2)
+    assert (u.rms, u.explains) == pytest.approx((math.sqrt(1.56) * 1e-6, (1.6 / 3) ** 2))
     assert u.unexplained
 
 
@@ -620,8 +616,7 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(study: Discovery
         return dataclasses.replace(study, effects=effects, moves=moves).sentences()[-1]
 
     assert (description_of(soft, moves=(1e-10, 1e-10, 9.9e-10)), description_of(lag)) == (right, not_corrected)
-    assert description_of(soft, lag) == not_corrected
-    assert description_of(rotated, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
+    assert (description_of(soft, lag), description_of(rotated, soft, moves=(1e-6, 0.0, 2e-6))) == (not_corrected, wrong)
     assert description_of(rotated, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
 
 

@@ -74,8 +74,7 @@ def rotated() -> Discovery:
 @pytest.mark.slow
 def test_nothing_missing_is_the_answer_to_noise() -> None:
     discovery = discover([observe(RIG, seed=7)], RIG, bank=BANK)
-    assert discovery.verdict == 'nothing_missing'
-    assert discovery.effects == ()
+    assert (discovery.verdict, discovery.effects) == ('nothing_missing', ())
     assert discovery.gap_after == pytest.approx(discovery.gap_floor, rel=0.05)
     assert discovery.sentence.startswith('Nothing is missing')
 
@@ -102,8 +101,7 @@ def test_the_model_closes_the_gap_on_new_data(rotated: Discovery, tmp_path: Path
     path = tmp_path / 'model.yaml'
     path.write_text(described(RIG, rotated.active_effects))
     model = load_rig(path)
-    assert model.values == RIG.values
-    assert [a.effect.name for a in effects_of_rig(model)] == ['sensor_rotation']
+    assert (model.values, [a.effect.name for a in effects_of_rig(model)]) == (RIG.values, ['sensor_rotation'])
     observed = observe(with_effect('sensor_rotation', psd=2, angle=0.002), seed=9, known=model)
     again = discover([observed], model, without=[n for n in effect_names() if n not in NEAR])
     assert again.verdict == 'nothing_missing'
@@ -157,8 +155,7 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     )
     out = tmp_path / 'out'
     assert main(['discover', str(recorded), '--out', str(out), '--quiet']) == 0
-    message = capsys.readouterr().out
-    assert 'sensor_gain (psd 1) is missing' in message
+    assert 'sensor_gain (psd 1) is missing' in capsys.readouterr().out
     tree = json.loads((out / 'result.json').read_text())
     check_schema(tree)
     assert tree['provenance']['forward_simulations'] <= 2000
@@ -255,8 +252,7 @@ def test_bad_words_of_simulate_are_rejected(
 
 @pytest.mark.slow
 def test_a_finding_has_a_name_that_other_programs_know() -> None:
-    known = SCHEMA['properties']['setup']['items']['properties']['name']['enum']
-    assert set(NAMES) <= set(known)
+    assert set(NAMES) <= set(SCHEMA['properties']['setup']['items']['properties']['name']['enum'])
     with pytest.raises(ValueError, match='load_size: must be one of channel_sign'):
         Finding('load_size', 'load 3', None, '')
 
@@ -652,10 +648,8 @@ def test_command_prints_lines_and_puts_them_in_model(tmp_path: Path, capsys: pyt
     assert 'set-up: channel_sign y1: psd_1.axes: [x, -y]' in message
     assert 'set-up: sample_rate converter.sample_rate_hz: converter.sample_rate_hz: 800' in message
     model: Rig = load_rig(out / 'model.yaml')
-    assert model.psds[0].axes == ('x', '-y')
-    assert model.converter.sample_rate_hz == 800.0
+    assert (model.psds[0].axes, model.converter.sample_rate_hz) == (('x', '-y'), 800.0)
     tree = json.loads((out / 'result.json').read_text())
-    assert tree['verdict'] == 'nothing_missing'
-    assert [s['name'] for s in tree['setup']] == ['sample_rate', 'channel_sign']
+    assert (tree['verdict'], [s['name'] for s in tree['setup']]) == ('nothing_missing', ['sample_rate', 'channel_sign'])
     assert clean(read_observation(path, model), ())[1] == []
     assert correct_wiring([read_observation(path, model)], ())[1] == []

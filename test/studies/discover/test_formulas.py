@@ -215,8 +215,7 @@ def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
 
 
 def test_folds_are_dealt_out_in_turn(workspace: Workspace) -> None:
-    cases = max(int(c.max()) for c in workspace.case) + 1
-    assert workspace.folds().tolist() == [i % 4 for i in range(cases)]
+    assert workspace.folds().tolist() == [i % 4 for i in range(max(int(c.max()) for c in workspace.case) + 1)]
     assert workspace.case[1].min() == workspace.case[0].max() + 1
     single = Workspace([make_observation(history=np.zeros((400, 3)), warm=None)])
     assert single.folds().tolist() == [0, 1, 2, 3]
@@ -337,8 +336,7 @@ def test_a_channel_is_stuck_from_three_hundredths_of_a_second_on(count: int, is_
         high[100 : 100 + count, 1] = limit
         assert not stuck(high, 1e-3, np.full(2, 0.01), 1e-3).any()
     assert not stuck(volts, 1e-3, np.full(2, 1e-3), 1e-3).any()
-    dead = np.full((500, 2), 0.7)
-    assert stuck(dead, 1e-3, np.full(2, 0.01), 1e-3).all()
+    assert stuck(np.full((500, 2), 0.7), 1e-3, np.full(2, 0.01), 1e-3).all()
     # Eight samples at least, however slow they are taken.
     slow = rng.standard_normal((100, 1))
     slow[20:27, 0] = 0.1
@@ -357,14 +355,12 @@ def test_what_is_known_of_a_recording_is_reported() -> None:
     assert (coverage.name, coverage.value, coverage.evidence) == ('load_coverage', 150 / 1200, 150 / 1200)
     assert 'its first 0.10 s and its last 0.05 s' in coverage.fix
     gone = np.isnan(cleaned.volts).all(axis=1)
-    assert np.flatnonzero(gone).tolist() == [*range(100), *range(1150, 1200)]
-    assert cleaned.digest == reported.hashed()
+    assert (np.flatnonzero(gone).tolist(), cleaned.digest) == ([*range(100), *range(1150, 1200)], reported.hashed())
     for unknown, gone_samples in (((100, 0), range(100)), ((0, 100), range(1100, 1200))):
         half, (finding,) = clean(dataclasses.replace(o, unknown_load=unknown), ())
         assert finding.value == pytest.approx(100 / 1200)
         assert np.flatnonzero(np.isnan(half.volts).all(axis=1)).tolist() == list(gone_samples)
     # Up to a twentieth is left out and not told; and what is whole stays as it is.
     quiet, findings = clean(dataclasses.replace(o, unknown_load=(30, 30)), ())
-    assert findings == []
-    assert np.isnan(quiet.volts).all(axis=1).sum() == 60
+    assert (findings, np.isnan(quiet.volts).all(axis=1).sum()) == ([], 60)
     assert clean(o, ())[0] is o

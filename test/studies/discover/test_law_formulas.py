@@ -326,14 +326,12 @@ def test_noise_growing_with_load_has_size_and_evidence(monkeypatch: pytest.Monke
             held_out, squares[fold != k].mean()
         )
     assert trial.heldout.gain == pytest.approx(0.5 * want, rel=1e-9)
-    assert trial.laws == (trial.law,)
-    assert [law.stage for law in trial.equivalent] == ['psd']
+    assert (trial.laws, [law.stage for law in trial.equivalent]) == ((trial.law,), ['psd'])
     assert trial.adopted('mine') == dataclasses.replace(trial.law, name='mine')
     # One cause on two quantities is one law.
     other = dataclasses.replace(trial.law, acts_on='x1')
     twice = dataclasses.replace(trial, further=(other,))
-    assert twice.adopted('mine') == dataclasses.replace(trial.law, name='mine', further=(other,))
-    assert trial.beside == ()
+    assert (twice.adopted('mine'), trial.beside) == (dataclasses.replace(trial.law, name='mine', further=(other,)), ())
     added = float(np.mean((term.coefficient * known) ** 2)) / 4.0 / 20.0
     assert trial.heldout_gap == pytest.approx(math.sqrt(max(heldout_gap(workspace, fit) ** 2 - added, 0.0)), rel=1e-9)
     assert laws.find_jitter(workspace, fit, gain) is None
@@ -410,8 +408,7 @@ def test_an_effect_that_stood_in_for_the_law_goes(more: float, remaining: tuple[
 def test_a_term_that_the_law_does_not_miss_goes(without: float, terms_left: str) -> None:
     seeker = Given({('dx dy', ''): 100.0, ('dx', ''): without, ('dy', ''): 300.0}, chi2=0.0)
     got = seeker.grown(seeker.trial([law_of('dx', 'dy')], (), 1))
-    assert ' '.join(got.variables) == terms_left
-    assert got.terms == len(terms_left.split())
+    assert (' '.join(got.variables), got.terms) == (terms_left, len(terms_left.split()))
 
 
 @pytest.mark.parametrize(('second', 'grown'), [(89.9, 'dx dy'), (90.0, 'dx'), (90.1, 'dx')])
@@ -458,11 +455,9 @@ def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(laws, 'score', lambda *_: scored)
     seeker = Given({(v, ''): 100.0 - i for i, v in enumerate(names)})
     got = seeker.first()
-    quick = [a[0] for a in seeker.asked if a[2] == 3]
-    assert quick == names[:12]
+    assert [a[0] for a in seeker.asked if a[2] == 3] == names[:12]
     assert [a[0] for a in seeker.asked if a[2] == 8] == names[::-1][:3]
-    assert [t.cost for t in got] == sorted(t.cost for t in got)
-    assert len(got) == 12
+    assert ([t.cost for t in got], len(got)) == (sorted(t.cost for t in got), 12)
     weak = [scored[0], law_features.Scored('y2', LawTerm('product', ('dy',)), 29.9)]
     monkeypatch.setattr(laws, 'score', lambda *_: weak)
     seeker = Given({})

@@ -59,8 +59,7 @@ def test_what_is_stuck_is_reported_with_its_place_and_share() -> None:
     volts[500:560, 4] = volts[500, 4]
     cleaned, (finding,) = cleaning.clean(dataclasses.replace(o, volts=volts), ())
     assert (finding.name, finding.where) == ('stuck_channel', 'y2')
-    assert finding.value == pytest.approx(0.4)
-    assert finding.evidence == pytest.approx(100 / 1200)
+    assert (finding.value, finding.evidence) == pytest.approx((0.4, 100 / 1200))
     assert finding.fix.startswith('y2 of seen keeps one value from 0.400 s on, 0.100 s in all')
     gone = np.isnan(cleaned.volts[:, 4])
     assert gone[400:440].all()
@@ -94,8 +93,7 @@ def gappy() -> Workspace:
 )
 def test_a_fine_block_divides_a_block(rate: float, size: int) -> None:
     rig = replace_values(RIG, {'converter.sample_rate_hz': rate})
-    o = Observation('x', rig, np.zeros((100, 6)), np.zeros((100, 3)))
-    assert Workspace([o]).fine == [size]
+    assert Workspace([Observation('x', rig, np.zeros((100, 6)), np.zeros((100, 3)))]).fine == [size]
 
 
 def test_noise_has_a_floor_of_its_file() -> None:
@@ -265,8 +263,7 @@ def test_a_memory_of_noise_is_that_of_its_process() -> None:
     white = SlowNoise.of(slow.corners, n, 1e-3).whiten(slow.draw(n, 1e-3, np.random.default_rng(0)).T)
     np.testing.assert_allclose(white.T, drawn, atol=1e-12)
     # A level below the floor has no memory.
-    floor = np.full(6, 2.0 * sigma)
-    assert estimate_noise(o, rows, 4, floor).coloured == (False,) * 6
+    assert estimate_noise(o, rows, 4, np.full(6, 2.0 * sigma)).coloured == (False,) * 6
 
 
 def test_a_line_persists_though_most_of_a_quarter_was_left_out() -> None:
@@ -415,13 +412,11 @@ def test_others_are_refitted_without_removed_effect() -> None:
     both = steps.weigh(steps.search(begun(Library(plant))))
     at = [a.effect.name for a in both.fit.effects].index('a')
     reduced = steps.without_effect(both, at, 'is not wanted')
-    assert names(reduced.fit) == ['b']
-    assert reduced.heldout == (both.heldout[1 - at],)
+    assert (names(reduced.fit), reduced.heldout) == (['b'], (both.heldout[1 - at],))
     assert len(reduced.result.delta_chi2) == 1
     assert reduced.result.fit is both.fit
     assert reduced.search.trace[-1] == 'a is not wanted'
-    none = steps.without_effect(reduced, 0, 'neither')
-    assert none.fit is reduced.result.null
+    assert steps.without_effect(reduced, 0, 'neither').fit is reduced.result.null
 
 
 def test_gap_before_is_that_of_original_recording() -> None:
@@ -460,8 +455,7 @@ def test_noise_of_a_sum_is_no_gap() -> None:
     fit = refit(workspace, ())
     jitter = laws.find_jitter(workspace, fit, 3.0)
     assert jitter is not None
-    assert jitter.channels == ('sum2',)
-    assert jitter.heldout_gap == validate.heldout_gap(workspace, fit)
+    assert (jitter.channels, jitter.heldout_gap) == (('sum2',), validate.heldout_gap(workspace, fit))
     (term,) = jitter.law.terms
     squares = workspace.split(fit.residual)[0][5] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
@@ -618,8 +612,7 @@ def test_radius_material_or_loads_explain_stiffnesses() -> None:
     radius, loads = tie.causes
     assert (radius.name, loads.name) == ('link_radius', 'load_unit')
     # A tube whose radii are multiplied by this has both stiffnesses multiplied by its fourth power.
-    assert radius.factor**4 == pytest.approx(1.0 + tie.share)
-    assert loads.factor * (1.0 + tie.share) == pytest.approx(1.0)
+    assert (radius.factor**4, loads.factor * (1.0 + tie.share)) == pytest.approx((1.0 + tie.share, 1.0))
     for cause, power in ((radius, 0.25), (loads, -1.0)):
         low, high = ((1.0 + share) ** power for share in (tie.share - tie.sd, tie.share + tie.sd))
         assert cause.sd == pytest.approx(abs(high - low) / 2.0, rel=1e-3)

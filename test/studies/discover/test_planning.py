@@ -221,8 +221,7 @@ def test_the_command_settles_what_one_length_leaves_open(
     assert 'The answer is unique after 1 more recording.' in capsys.readouterr().out
     tree = json.loads((tmp_path / 'result.json').read_text())
     assert tree['next'] is None
-    assert tree['run']['outcome'] == 'unique'
-    assert [e['name'] for e in tree['effects']] == ['clamp_bending_compliance']
+    assert (tree['run']['outcome'], [e['name'] for e in tree['effects']]) == ('unique', ['clamp_bending_compliance'])
     (made,) = tree['run']['recordings']
     assert made['overrides'] == {'link.length': 0.409}
     (observed,) = read_observations([tmp_path / 'next.yaml'])
@@ -241,8 +240,7 @@ def test_a_plan_is_written_as_files_that_the_commands_take(
     script = load_history(str(tmp_path / 'next_loads.csv'), 1000.0).loads
     assert np.array_equal(script, plan.loads)
     command = shlex.split(lines[1])
-    assert command[:2] == ['psd-deflection', 'simulate']
-    assert main(command[1:]) == 0
+    assert (command[:2], main(command[1:])) == (['psd-deflection', 'simulate'], 0)
     (observed,) = read_observations([tmp_path / 'next.yaml'])
     assert observed.rig.link.length == 0.409
     assert np.array_equal(observed.loads, plan.loads)
@@ -515,8 +513,7 @@ def test_workspace_reports_slow_noise_of_recording() -> None:
     (reported,) = ws.provenance()
     assert reported['corners_hz'] == ws.noise[0].corners.tolist()
     assert ws.noise[0].corners == pytest.approx(np.full(6, 5.0), rel=0.4)
-    plain = Workspace([observed(0.0, 1)])
-    assert ws.floor() > 1.2 * plain.floor()
+    assert ws.floor() > 1.2 * Workspace([observed(0.0, 1)]).floor()
     residual, _ = ws.residual(())
     assert float(residual @ residual) / ws.size == pytest.approx(1.0, abs=0.05)
 

@@ -100,8 +100,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     assert math.isnan(ws.floor())
     ws = ws.begun(refit(ws, ()))
     # Newtons and radians have no sum: each is a share of its gap before.
-    assert ws.gap(observed) == pytest.approx(1.0)
-    assert ws.gap(residual) == pytest.approx(0.5)
+    assert (ws.gap(observed), ws.gap(residual)) == pytest.approx((1.0, 0.5))
     mixed = [rows * [[1.0], [0.5]] for rows in observed]
     assert ws.gap(mixed) == pytest.approx(math.sqrt((1.0 + 0.25) / 2.0))
     assert (ws.unit, ws.display_scale, ws.display_units) == (
@@ -125,8 +124,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     with pytest.raises(ConfigError, match=r'levers = \(1\.0,\): must be one number above 0 for each channel'):
         PlantComparison(with_lever)
     same = PlantComparison(Pictures(observed, {}, units=('N', 'N'), noise=(0.3, 0.1)))
-    both = np.concatenate((forces, angles))
-    assert same.gap(observed) == pytest.approx(rms(both))
+    assert same.gap(observed) == pytest.approx(rms(np.concatenate((forces, angles))))
     assert same.floor() == pytest.approx(math.sqrt((28 * 0.3**2 + 22 * 0.1**2) / 50))
     assert (same.unit, same.display_scale, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
     # A number without a unit has none behind it.
@@ -207,8 +205,7 @@ def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float, stated: 
     ws = PlantComparison(Pictures(observed, {}, period=period, noise=(stated, 1e-3)))
     # Two pieces of each of three cases, four being wanted.
     cases = [i * 2 + np.arange(n) * 2 // n for i, n in enumerate(LENGTHS)]
-    assert [c.tolist() for c in ws.case] == [c.tolist() for c in cases]
-    assert ws.folds().tolist() == list(range(6))
+    assert ([c.tolist() for c in ws.case], ws.folds().tolist()) == ([c.tolist() for c in cases], list(range(6)))
     np.testing.assert_array_equal(ws.row_cases(), np.concatenate([np.tile(c, 2) for c in cases]))
     want = np.zeros(6)
     least = (np.array([stated, 1e-3]) / ws.level) ** 2
@@ -421,13 +418,11 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
         # Wilson and Hilferty: the cube root of a chi-square over its mean is normal.
         deviation = 2.0 / (9.0 * dof)
         assert cell.statistic == pytest.approx(((energy / dof) ** (1 / 3) - 1.0 + deviation) / math.sqrt(deviation))
-        assert located.map[case, c, 0] == cell.statistic
-        assert cell.when == (0.0, LENGTHS[case] * period)
+        assert (located.map[case, c, 0], cell.when) == (cell.statistic, (0.0, LENGTHS[case] * period))
         assert cell.band == (0.0, 0.5 / period if period else 0.0)
         names = [d.regressor for d in located.dependences if d.channel == channel and d.p < 0.01]
         assert cell.depends_on == tuple(names[:2])
-    assert located.map.shape == (3, 2, 1)
-    assert located.map[1, 1, 0] == 0.0
+    assert (located.map.shape, located.map[1, 1, 0]) == ((3, 2, 1), 0.0)
     assert [c.statistic for c in located.cells] == sorted((c.statistic for c in located.cells), reverse=True)
     assert located.spans == tuple((i, 0.0, n * period) for i, n in enumerate(LENGTHS))
     assert (located.excess, located.p) == (located.dependences[0].gain, located.dependences[0].p)
@@ -480,8 +475,7 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         assert study.per_channel[channel] == pytest.approx(pair, rel=1e-3)
         assert study.heldout_per_channel[channel] == pytest.approx(pair[1], rel=0.1)
     assert study.waterfall == (('as described', study.gap_before), ('+ b', study.gap_after), ('noise alone', 0.02))
-    assert study.simulations == len(plant.asked)
-    assert message[0] == 'simulating the plant as it is described'
+    assert (study.simulations, message[0]) == (len(plant.asked), 'simulating the plant as it is described')
     assert [s for s in message if s in ('signatures of every effect', 'weighing', 'alternatives', 'where')] == [
         'signatures of every effect',
         'weighing',
@@ -573,5 +567,4 @@ def test_rehearsal_counts_what_is_named_and_sizes_inside() -> None:
     assert sizes == '2 of 3 sizes were within their 95 % intervals.'
     # What is unknown is not simulated.
     unknown = dataclasses.replace(rehearsal, expected=(gain, skew, UNKNOWN))
-    assert unknown.tree()['again'] == 3
-    assert unknown.sentences()[-1] == 'The simulated recordings lack what is unknown.'
+    assert (unknown.tree()['again'], unknown.sentences()[-1]) == (3, 'The simulated recordings lack what is unknown.')

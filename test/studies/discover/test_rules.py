@@ -186,8 +186,7 @@ def test_a_refit_is_least_squares_with_its_covariance() -> None:
     assert fit.residual == pytest.approx(data - matrix @ want, abs=1e-5)
     np.testing.assert_allclose(fit.jacobian, matrix, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(fit.covariance(), np.linalg.inv(matrix.T @ matrix), rtol=1e-6)
-    assert fit.free == ((0, 'x'), (0, 'y'), (1, 'x'))
-    assert [fit.columns_of(i) for i in (0, 1)] == [[0, 1], [2]]
+    assert (fit.free, [fit.columns_of(i) for i in (0, 1)]) == (((0, 'x'), (0, 'y'), (1, 'x')), [[0, 1], [2]])
     assert (fit.parameters, fit.at_bound) == (3, ())
     # The start, one pass of three differences, a step; then one more, which gains nothing.
     assert plant.simulations <= 12
@@ -216,8 +215,7 @@ def test_a_refit_stops_at_a_bound_and_the_rest_adapts() -> None:
         fit = refit(
             plant, [active('a', least, most, x=0.5 * (max(least, -0.01) + min(most, 0.01))), active('b', x=0.0)]
         )
-        assert fit.at_bound == ((0, 'x'),)
-        assert fit.effects[0].values['x'] == end
+        assert (fit.at_bound, fit.effects[0].values['x']) == (((0, 'x'),), end)
         residual = (plant.measured[0] - end * shown['a', 'x']).ravel()
         want = residual @ shown['b', 'x'].ravel() / np.sum(shown['b', 'x'] ** 2)
         assert fit.effects[1].values['x'] == pytest.approx(want, abs=1e-8)
@@ -354,8 +352,7 @@ def test_an_effect_whose_size_may_be_zero_is_not_named(
     fit = dataclasses.replace(result.fit, jacobian=weaker * result.fit.jacobian)
     lost = result.null.chi2 - fit.chi2
     assert wald_chi_square(plant, fit, 0) == pytest.approx(weaker**2 * lost, rel=1e-3)
-    after = accepted(problem_of(search, dataclasses.replace(result, fit=fit)))
-    assert bool(after.fit.effects) is named
+    assert bool(accepted(problem_of(search, dataclasses.replace(result, fit=fit))).fit.effects) is named
 
 
 def test_infinite_nominal_has_infinite_wald_value() -> None:
@@ -374,8 +371,7 @@ def test_what_does_not_hold_on_unseen_load_cases_is_not_named(cases: Sequence[in
     search = search_of(Plant(shown, without_noise((shown[A], 60.0)) * inside / share))
     result = result_of(search, [active('a', x=0.0)])
     assert result.delta_chi2 == pytest.approx([60.0], rel=1e-3)
-    fit = accepted(problem_of(search, result)).fit
-    assert bool(fit.effects) == named
+    assert bool(accepted(problem_of(search, result)).fit.effects) == named
 
 
 def test_an_amplitude_at_its_bound_is_named_only_if_off_there() -> None:
@@ -386,8 +382,7 @@ def test_an_amplitude_at_its_bound_is_named_only_if_off_there() -> None:
         if least == 0.0:
             search = search_of(Plant(shown, 5e-3 * shown['a', 'x'] - 1e-3 * shown['a', 'y'] + noise()))
         start = active('a', least, most, x=0.0, y=0.0)
-        fit = accepted(problem_of(search, result_of(search, [start]))).fit
-        assert bool(fit.effects) == named
+        assert bool(accepted(problem_of(search, result_of(search, [start]))).fit.effects) == named
 
 
 @pytest.mark.parametrize(('apart', 'open_level', 'named'), [(0.11, False, 2), (0.09, False, 1), (0.09, True, 2)])
@@ -414,8 +409,7 @@ def test_weakest_effect_goes_first_then_reweighed() -> None:
     weakest = int(
         np.argmin([result_of(search, [active('a', x=0.0)]).fit.chi2, result_of(search, [active('b', x=0.0)]).fit.chi2])
     )
-    assert [a.effect.name for a in after.fit.effects] == ['ab'[weakest]]
-    assert len(after.heldout) == 1
+    assert ([a.effect.name for a in after.fit.effects], len(after.heldout)) == (['ab'[weakest]], 1)
 
 
 @pytest.mark.parametrize(('gain', 'stays'), [(13.5, True), (12.5, False)])
@@ -766,8 +760,7 @@ def test_dependence_is_chi_square_of_regressor() -> None:
     gains = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, known)}
     assert gains['x1', 'dot_x^2'] == pytest.approx((e @ column) ** 2 / (column @ column), rel=1e-6)
     best = max(dependences(workspace, table, residual, None), key=lambda d: d.gain)
-    count = len(gains)
-    assert best.p == pytest.approx(1.0 - (1.0 - chi2_law.sf(best.gain, 1)) ** count, rel=0.05)
+    assert best.p == pytest.approx(1.0 - (1.0 - chi2_law.sf(best.gain, 1)) ** len(gains), rel=0.05)
 
 
 def test_counts_gaps_and_floor_of_a_workspace() -> None:

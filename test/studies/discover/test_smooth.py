@@ -178,7 +178,6 @@ def test_shared_sizes_leave_the_likelihood_once() -> None:
 
 @pytest.mark.slow
 def test_sixty_parts_and_eight_inputs_take_few_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What takes the time is counted."""
     rng, asked, names = np.random.default_rng(1), itertools.count(), [f'u{i}' for i in range(8)]
     u, likelihood = rng.uniform(-1.0, 1.0, (60, 8)), smoothing.negative_log_likelihood
     y = np.column_stack([2.0 * u[:, 0] - u[:, 1] + np.sin(6.0 * u[:, 2]), u @ rng.standard_normal(8)])

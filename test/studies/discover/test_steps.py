@@ -78,8 +78,7 @@ def test_a_stand_in_is_dropped_once_the_causes_are_there() -> None:
     plant = Plant(shown, without_noise((shown[A], 3000.0), (shown[B], 3000.0)) + noise())
     message: list[str] = []
     result = ran(searching(plant, shown, 'abc', message))
-    assert message[0] == 'adding c'
-    assert named(result.fit) == ['a', 'b']
+    assert (message[0], named(result.fit)) == ('adding c', ['a', 'b'])
     assert len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == len(result.alternatives) == 2
     assert result.null.effects == ()
     assert all(line.endswith(']') for line in result.trace)
@@ -162,8 +161,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     rows = [(candidate('sample_rate', 'error'), [[1e-3 * shown['sample_rate', 'error']]])]
     search = Search(plant, lambda ws, _: Screen(ws, rows))
     null = refit(plant, ())
-    first = mistake(search, null, search.screen.score(null.residual))
-    assert named(first) == ['sample_rate']
+    assert named(mistake(search, null, search.screen.score(null.residual))) == ['sample_rate']
     assert {-0.2, -0.1, -0.05, 0.05, 0.1, 0.25} <= set(tried)
 
 
@@ -262,8 +260,7 @@ def test_the_better_of_two_alike_stays_the_other_is_listed(monkeypatch: pytest.M
     # From the worse one it swaps to the better.
     null, worse = refit(plant, ()), refit(plant, [active('b', x=0.0)])
     better, fits = search.swap(null, worse)
-    assert named(better) == ['a']
-    assert [named(f) for f in fits[0]] == [['b']]
+    assert (named(better), [named(f) for f in fits[0]]) == (['a'], [['b']])
     assert search.library_p(9.0, 1) == pytest.approx(1.0 - (1.0 - chi2_law.sf(9.0, 1)) ** 2)
     assert search.library_p(-1.0, 1) == 1.0
     assert search.penalty == pytest.approx(math.log(size * 4 / 20))
@@ -322,8 +319,7 @@ def test_cells_are_normal_deviates_of_their_energy(explains: bool) -> None:
     np.testing.assert_allclose(located.spans, [(0, 0.2 * k, 0.2 * (k + 1)) for k in range(8)])
     significant = [c for c in located.cells if c.p < 0.01]
     assert located.excess == pytest.approx(sum(c.energy for c in significant), rel=1e-6)
-    few = localise(plant, residual.ravel(), None, np.random.default_rng(1), limit=3)
-    assert len(few.cells) == 3
+    assert len(localise(plant, residual.ravel(), None, np.random.default_rng(1), limit=3).cells) == 3
 
 
 def test_the_chance_of_the_greatest_cell_is_that_of_noise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,8 +104,7 @@ def test_a_mode_in_words() -> None:
     twist = Mode(21.0, 0.02, 0.03, 0.001, math.radians(0.0125))
     answer = of_axes((x, mode(40.0)), (), (twist,))
     words = ('14.000 ± 0.020', '0.0200 ± 0.0020', '12.3 µm', '1 ring-down')
-    assert answer.mode_words(0, x) == words
-    assert answer.mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
+    assert (answer.mode_words(0, x), answer.mode_words(2, twist)[2:]) == (words, ('12.5 mdeg', '1 ring-down'))
     assert of_axes((x,), (), (), stretches=2).mode_words(0, x)[3] == '2 ring-downs'
     assert of_axes((x,), (), (), stretches=0).mode_words(0, x)[3] == 'the spectrum in operation'
     best = answer.shaper_of(0)
@@ -141,8 +140,7 @@ def test_numbers_for_machines_are_in_si_units() -> None:
         'damping_ratio_sd': 0.001,
         'amplitude': 12e-6,
     }
-    assert dx['modes'] == [expected]
-    assert len(tree['axes']['theta']['modes']) == 2
+    assert (dx['modes'], len(tree['axes']['theta']['modes'])) == ([expected], 2)
 
 
 @pytest.fixture(scope='module')

@@ -155,8 +155,7 @@ def test_stretches_begin_after_a_blow_and_end_before_the_next() -> None:
     assert (stretches[0].first, stretches[0].last) == (first, last)
     second = last + 32 * math.ceil((2000 - last) / 32)
     assert stretches[1].first == second
-    assert stretches[1].last == second + 384 + 192 * ((3500 - second - 384) // 192)
-    assert len(stretches) == 2
+    assert (stretches[1].last, len(stretches)) == (second + 384 + 192 * ((3500 - second - 384) // 192), 2)
     # The end of the recording may be the end of a stretch.
     end = stretches[1].last
     assert fitting.scan_windows(samples[:end], SAMPLE_RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end
@@ -182,8 +181,7 @@ def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     # Windows of six periods each half a period, of the frequency that is known at first.
     window, hop = round(6.0 * SAMPLE_RATE / 15.5), round(0.5 * SAMPLE_RATE / 15.5)
     firsts = [hop * math.ceil(650 / hop)]
-    assert stretches[0].first == firsts[0]
-    assert (stretches[0].last - stretches[0].first - window) % (window // 2) == 0
+    assert (stretches[0].first, (stretches[0].last - stretches[0].first - window) % (window // 2)) == (firsts[0], 0)
     assert stretches[0].last <= 2000 < stretches[0].last + window // 2
     assert 2000 <= stretches[1].first < 2000 + hop
     np.testing.assert_allclose(modes, [(16.0, 0.02)], rtol=2e-3)
@@ -324,8 +322,7 @@ def test_the_fit_goes_through_the_samples_of_each_stretch() -> None:
         [(16.1, 0.01)],
         [fitting.Stretch(samples, *ends, SAMPLE_RATE) for ends in ((660, 1900), (2010, 3400))],
     )
-    assert identified.stretches == ((660, 1900), (2010, 3400))
-    assert identified.how == 'ring-down'
+    assert (identified.stretches, identified.how) == (((660, 1900), (2010, 3400)), 'ring-down')
     (mode,) = identified.modes
     assert abs(mode.frequency - 16.0) < 4.0 * mode.frequency_sd
     assert abs(mode.damping - 0.02) < 4.0 * mode.damping_sd
@@ -479,8 +476,7 @@ def test_in_operation_the_spectrum_reports_it() -> None:
 def test_noise_has_no_mode() -> None:
     for seed in range(3):
         identified = fitting.modes_of(np.random.default_rng(seed).normal(0.0, 2e-6, 5000), RATE)
-        assert identified.modes == ()
-        assert identified.how == 'none'
+        assert (identified.modes, identified.how) == ((), 'none')
 
 
 HALF_KHZ = 500.0

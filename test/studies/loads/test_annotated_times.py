@@ -600,8 +600,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     for at, reported in ((2800 - width, []), (2799 - width, [3.01]), (3200 + width, []), (3201 + width, [3.01])):
         assert annotated_times.unannotated_steps(RIG, dots, annotated_at(at, 8000)) == reported
     # A ramp is one change, which ends once; one that comes two samples later is another.
-    ramp = annotated_at(*range(8000, 8100))
-    assert annotated_times.unannotated_steps(RIG, dots, ramp) == [3.01]
+    assert annotated_times.unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100))) == [3.01]
     assert annotated_times.unannotated_steps(RIG, dots, annotated_at(8000, 8002)) == []
     # Its end may come with a note of the next one within a quarter of a second.
     assert annotated_times.unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8200)) == []
@@ -638,8 +637,7 @@ def test_load_cell_noise_is_removed_for_any_times(monkeypatch: pytest.MonkeyPatc
     with_pieces(monkeypatch, as_steps((400.0, 1e-4)), {400.0: (0.4, 0.0)})
     corrected = annotated_times.correct_loads(RIG, dots, noisy)
     assert corrected is not None
-    assert [m.first for m in corrected.measured] == [0, 1500]
-    assert [n.applied for n in corrected.notes] == [0.4]
+    assert ([m.first for m in corrected.measured], [n.applied for n in corrected.notes]) == ([0, 1500], [0.4])
 
 
 PLATE_RIG = load_rig(

@@ -32,8 +32,7 @@ WORDS = {
 def test_check_calibrate_and_discover_name_load_alike(annotated: FloatArray, name: str, where: str) -> None:
     checked, run, log, discovery = answers(QUIET, annotated)
     assert [(f.name, f.where) for f in checked.findings] == [(name, where)]
-    assert _rounded(checked.findings[0].fix) == WORDS[name]
-    assert checked.verdict == 'wrong'
+    assert (_rounded(checked.findings[0].fix), checked.verdict) == (WORDS[name], 'wrong')
     assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
     assert [_rounded(words) for words in log] == [WORDS[name]]
     assert run.loads is not None
@@ -427,8 +426,7 @@ def test_applied_load_is_single_change_of_doubled_note() -> None:
 
     (note,) = holds.wrong_notes_against(annotated, 1e-3, asked)
     assert note.exact
-    assert note.applied.tolist() == APPLIED_ONCE.tolist()
-    assert note.where == 'load 4'
+    assert (note.applied.tolist(), note.where) == (APPLIED_ONCE.tolist(), 'load 4')
     words = replace(note, applied=np.array((20.126, -0.001, 17.5))).words('x')
     assert words.endswith('(20.13 N, 0 N, 17.5 N m) hung, not (16 N, -20 N, 35 N m): note that')
     # One that others are like is what the readings say.

@@ -48,8 +48,7 @@ def test_sway_is_named_alike_everywhere() -> None:
     assert np.isnan(steady.volts[12_000:16_000]).all()
     assert np.isfinite(steady.volts[:12_000]).all()
     assert np.isfinite(steady.volts[20_000:]).all()
-    assert [f.fix for f in discovery.setup] == [words]
-    assert discovery.verdict == 'nothing_missing'
+    assert ([f.fix for f in discovery.setup], discovery.verdict) == ([words], 'nothing_missing')
 
 
 @pytest.mark.slow
@@ -306,8 +305,7 @@ def test_noise_correlation_is_below_four_over_root_n(count: int, memory: float, 
     if noise:
         assert loads[:, 1] == pytest.approx(np.full(2 * count, values.mean()))
     assert len(measured_along_y(1e-3 * values)[1]) == noise
-    first = with_memory(count, 0.0)
-    assert len(measured_along_y(np.concatenate((first, 1000.0 + values)))[1]) == 1 + noise
+    assert len(measured_along_y(np.concatenate((with_memory(count, 0.0), 1000.0 + values)))[1]) == 1 + noise
     # That along Y says all, whatever the others do.
     both = np.zeros((2 * count, 3))
     both[:, 1] = np.repeat(values, 2)

@@ -54,8 +54,7 @@ def test_a_bump_is_reported_as_by_the_command(bumped: Path, tmp_path: Path, caps
     first = watched.alarms[0]
     assert watched.since_s(first) == pytest.approx(18.0, abs=1.0)
     table = watched.to_pandas()
-    assert table.index[0] == watched.since_s(first)
-    assert table['channel'].iloc[0] == first.channel
+    assert (table.index[0], table['channel'].iloc[0]) == (watched.since_s(first), first.channel)
     assert [path.name for path in watched.save(tmp_path / 'out')] == ['report.html', 'watch.json']
     tree = json.loads((tmp_path / 'out' / 'watch.json').read_text())
     assert tree['alarms'][0]['channel'] == first.channel
