@@ -44,8 +44,7 @@ def test_the_numbers_of_the_rules() -> None:
 def test_failed_laser_costs_certainty_or_warm_up() -> None:
     """The link swings slowly and for ever: an estimate is held against the pose in the middle of its block."""
     slow = {'dynamics.bending_frequency': 1.0, 'dynamics.bending_damping_ratio': 0.0}
-    rig = load_rig(None, slow)
-    both, out, alone, cold, spare = simulated(rig, Lasers((1e-3, 1e-3), 1e-3, 0.5))
+    both, out, alone, cold, spare = simulated(load_rig(None, slow), Lasers((1e-3, 1e-3), 1e-3, 0.5))
     assert both.scatter == pytest.approx(both.deviations, rel=0.3)
     assert [p.estimates for p in (both, out, alone, cold, spare)] == [1.0, 1.0, 1.0, 0.0, 1.0]
     assert cold.status is BlockStatus.LASER_LOST

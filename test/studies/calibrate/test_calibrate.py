@@ -136,8 +136,7 @@ def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
     truth, runs = misaligned.draw(rng), []
     for _ in range(2):
         now = truth | {f'beam_{n}.{axis}': rng.normal(0.0, 3e-4) for n in (1, 2) for axis in 'xy'}
-        pose = misaligned.poses(misaligned.pushes(rng, 6, 1.2))
-        runs.append(campaign.run_of(misaligned.record(now, pose, rng)))
+        runs.append(campaign.run_of(misaligned.record(now, misaligned.poses(misaligned.pushes(rng, 6, 1.2)), rng)))
     calibration = calibrate(runs, nominal)
     assert calibration.fit.noise.dots == pytest.approx(1.0, abs=0.15)
     errors = np.array([(calibration.values[AT[n]] - v) / calibration.sd[AT[n]] for n, v in truth.items() if n in AT])

@@ -240,8 +240,7 @@ def test_a_push_stands_out_of_the_rest(shaking: float, size: float, taken: bool)
 
 @pytest.mark.parametrize(('shaking', 'taken'), [(149.0, True), (151.0, False)])
 def test_push_is_held_if_it_moves_below_three_tenths(shaking: float, taken: bool) -> None:
-    fed = Fed().rested()
-    message = fed.feed(FAR, WAIT + 1, shaking * MICRO)
+    message = Fed().rested().feed(FAR, WAIT + 1, shaking * MICRO)
     assert any(text.startswith('Got it') for text in message) is taken
     assert ('Hold it steadier.' in message) is not taken
 
@@ -250,8 +249,7 @@ def test_dot_at_range_end_is_reported_though_held() -> None:
     # Two counts below 10 V are the end; half a millimetre is a volt.
     step = 20.0 / 2**16
     for volt, ends in ((10.0 - 2.0 * step, True), (10.0 - 2.5 * step, False)):
-        fed = Fed().rested()
-        message = fed.feed((0.0, 0.0, -volt * 5e-4, 0.0), WAIT + 1)
+        message = Fed().rested().feed((0.0, 0.0, -volt * 5e-4, 0.0), WAIT + 1)
         assert ('A dot is at the end of its PSD: push less.' in message) is ends
         assert any(text.startswith('Got it') for text in message) is not ends
 

@@ -393,8 +393,7 @@ def test_a_limit_that_is_not_reached_at_first_is_found() -> None:
 @pytest.mark.slow
 def test_the_covariance_of_the_sizes_is_that_of_least_squares() -> None:
     plant = Spring(0.3, k=1.05)
-    discovery = psd_deflection.discover_in(plant)
-    tree = discovery.tree()
+    tree = psd_deflection.discover_in(plant).tree()
     names, matrix = tree['covariance']['names'], np.array(tree['covariance']['matrix'])
     terms = {'stiffness.scale': np.concatenate(plant.u), 'cubic.c': np.concatenate(plant.u) ** 3}
     assert sorted(names) == sorted(terms)
@@ -549,6 +548,17 @@ def test_like_numbers_of_unlike_quantities_are_two_effects(seed: int, words: lis
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('hertz', [5.0, 33.0, 60.0, 180.0])
+def test_ringing_that_nothing_explains_is_no_noise(hertz: float) -> None:
+    o, since = recorded(4), np.maximum(np.arange(len(SET_UP)) - 1000, 0) % 1000 / 1000.0
+    ringing = 2e-5 * np.exp(-1.5 * since) * np.sin(2.0 * np.pi * hertz * since) / RIG.amplifier.sensitivity
+    o.volts[:, [0, 1, 3, 4]] += ringing[:, None] * [1.0, 0.5, -0.7, 0.3]
+    discovery = found_in(o)
+    assert (discovery.verdict, discovery.floors > 1.5) == ('unknown_effect', True)
+    assert discovery.gap_floor == pytest.approx(Workspace([recorded(4)]).floor(), rel=0.05)
+
+
+@pytest.mark.slow
 def test_another_geometry_is_told_in_no_absurd_sizes() -> None:
     """Of small angles: two PSDs 30 cm away and a link five times as stiff would do the same, nearly."""
     exact, linear = (ForwardModel(RIG, []).run(share * SET_UP).dots.T / share for share in (1.0, 1e-3))
@@ -638,8 +648,7 @@ def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None =
 @pytest.mark.slow
 def test_command_prints_lines_and_puts_them_in_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Y of PSD 1 turned, and times of 800 samples a second against the 1000 of the rig file."""
-    rig = replace_values(RIG, {'converter.sample_rate_hz': 800.0})
-    counts = RigSimulator(rig, 0).step(SET_UP).counts
+    counts = RigSimulator(replace_values(RIG, {'converter.sample_rate_hz': 800.0}), 0).step(SET_UP).counts
     volts = counts.astype(np.float64) * RIG.converter.volts_per_count * np.array([1, -1, 1, 1, 1, 1])
     path = csv_of(Observation('seen', RIG, volts, SET_UP), tmp_path / 'seen.csv', 1.0 / 800.0)
     out = tmp_path / 'out'

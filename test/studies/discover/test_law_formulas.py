@@ -419,8 +419,7 @@ def test_a_further_term_must_gain_as_an_effect_must(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(laws, 'responses', lambda *_: [])
     monkeypatch.setattr(laws, 'score', lambda *_: offered)
     seeker = Given({('dx', ''): 100.0, ('dx dy', ''): second})
-    got = seeker.grown(seeker.trial([law_of('dx')], (), 1))
-    assert ' '.join(got.variables) == grown
+    assert ' '.join(seeker.grown(seeker.trial([law_of('dx')], (), 1)).variables) == grown
     # The two that explain most are refitted, no third.
     assert ('dx theta', '', 4) in seeker.asked
     assert ('dx x1', '', 4) not in seeker.asked

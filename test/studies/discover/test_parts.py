@@ -377,8 +377,7 @@ def test_unexplained_remainder_drops_weak_effects() -> None:
     shown = pictures(A)
     plant = Plant(shown, without_noise((shown[A], 200.0)) + noise())
     # Faster than blocks, so that no gap has it.
-    fast = Cell('x1', 0, (0.0, 1.0), (25.0, 60.0), (), 9.0, 0.0, 900.0)
-    residual = nowhere(p=0.0, excess=900.0, cells=(fast,))
+    residual = nowhere(p=0.0, excess=900.0, cells=(Cell('x1', 0, (0.0, 1.0), (25.0, 60.0), (), 9.0, 0.0, 900.0),))
     last = steps.solve(Library(plant, residual), STEPS, 0, lambda _: None)
     assert (steps.fields_of(last)['verdict'], names(last.fit), last.residual) == ('unknown_effect', [], residual)
     assert last.search.trace[-1].endswith('explains less than what remains unknown')

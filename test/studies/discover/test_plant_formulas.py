@@ -193,8 +193,7 @@ def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
         assert ws.loss(ws.whiten(other)) == pytest.approx(want)
     assert ws.loss(ws.whiten(other)) != pytest.approx(28 * (math.log(0.16) + 1.0) + 22 * (math.log(6.25) + 1.0))
     # A level below the noise is the noise.
-    loud = PlantComparison(Pictures(observed, {}, noise=(9.0, 9.0)))
-    assert loud.level.tolist() == [9.0, 9.0]
+    assert PlantComparison(Pictures(observed, {}, noise=(9.0, 9.0))).level.tolist() == [9.0, 9.0]
 
 
 @pytest.mark.parametrize('stated', [0.5, 1.2])
@@ -371,8 +370,7 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     assert all(np.array_equal(a, b[1], equal_nan=True) for a, b in zip(beside['turn / rad'], observed, strict=True))
     plant.units = ('', '')
     assert list(ws.against())[1:] == ['force', 'turn']
-    fit = refit(ws, [on('a', 0.5)], iterations=0)
-    named = plant_search.regressors(ws, fit)
+    named = plant_search.regressors(ws, refit(ws, [on('a', 0.5)], iterations=0))
     assert [channel for channel, _ in named] == ['force', 'turn']
     for c, (channel, of) in enumerate(named):
         for i, n in enumerate(LENGTHS):

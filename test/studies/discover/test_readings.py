@@ -242,9 +242,9 @@ def test_a_gauge_is_searched_beside_constant_columns(tmp_path: Path, rest: str, 
         load[axis], cells[axis] = f'{-9.81 * mass}', f'{-31.6e-3 * min(mass, 1.2):.6f}'
         lines.append(','.join([*load, *cells]))
     (tmp_path / 'beam.csv').write_text('\n'.join(lines) + '\n')
-    channel, told = ('ref_dx', 'ref_dy', 'ref_theta')[axis], list[str]()
-    discovery = discovered(read_tables([tmp_path / 'beam.csv']), (), None, told.append, 0)
-    assert [f'{channel} is the same in rows 7 to 9 under different loads' in words for words in told] == [True]
+    channel, reported = ('ref_dx', 'ref_dy', 'ref_theta')[axis], list[str]()
+    discovery = discovered(read_tables([tmp_path / 'beam.csv']), (), None, reported.append, 0)
+    assert [f'{channel} is the same in rows 7 to 9 under different loads' in words for words in reported] == [True]
     assert discovery.verdict in ('effects_found', 'unknown_effect')
     assert 0.0 < discovery.gap_before < 0.1 * 1e6
     assert [gaps[0] > 0.0 for gaps in discovery.per_channel.values()] == [i == axis or rest > '0' for i in range(3)]

@@ -270,8 +270,7 @@ def test_effect_weight_is_chi_square_lost_without_it() -> None:
     shown = pictures(A, ('b', 'x'), ('b', 'y'))
     shown['b', 'x'] += 0.5 * shown['a', 'x']
     plant = Plant(shown, 1e-4 * shown['a', 'x'] - 2e-4 * shown['b', 'x'] + noise())
-    search = search_of(plant, library=50, penalty=4.0)
-    result = result_of(search, [active('a', x=0.0), active('b', x=0.0, y=0.0)])
+    result = result_of(search_of(plant, library=50, penalty=4.0), [active('a', x=0.0), active('b', x=0.0, y=0.0)])
     data = plant.measured[0].ravel() / SIGMA
 
     def rss(*names: tuple[str, str]) -> float:
@@ -479,8 +478,7 @@ def test_weak_effects_are_dropped_before_alternatives(remains: float, names: lis
     plant = Plant(shown, without_noise((shown[A], 500.0), (shown['c', 'x'], 4000.0), (shown[B], remains)) + noise())
     rows = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'c')]
     search = Search(plant, lambda workspace, _: Screen(workspace, rows))
-    begun = refit(plant, [active('c', x=0.0), active('a', x=0.0)])
-    _, result = search.run(refit(plant, ()), begun)
+    _, result = search.run(refit(plant, ()), refit(plant, [active('c', x=0.0), active('a', x=0.0)]))
     assert sorted(a.effect.name for a in result.fit.effects) == names
 
 

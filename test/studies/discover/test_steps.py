@@ -476,8 +476,7 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_alternative: bool) -
     other = dataclasses.replace(
         fit, effects=(active('b', x=0.1, y=0.1),), chi2=fit.chi2 + loss, free=((0, 'x'), (0, 'y')), jacobian=jacobian
     )
-    null = refit(search.workspace, ())
-    result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], alternatives=[[other]])
+    result = steps.SearchResult(refit(search.workspace, ()), fit, [0.0], [99.0], [500.0], alternatives=[[other]])
     (named,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
     assert named.equivalent == ()
     assert [(r.active.effect.name, r.delta_bic, r.fit) for r in named.fitted_alternatives] == [

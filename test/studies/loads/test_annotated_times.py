@@ -411,8 +411,7 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     loads = np.column_stack((t, -2.0 * t, t**2))
     # Applied from sample 20 to 28: before is the sample before 19, after is the second one beyond 28.
     step = loads[30] - loads[18]
-    ramp = note(12.0, 10.0, 4.0)
-    effective = annotated_times.shifted(ramp, loads, 0.5)
+    effective = annotated_times.shifted(note(12.0, 10.0, 4.0), loads, 0.5)
 
     def share(start: float, took: float) -> FloatArray:
         return np.asarray(np.clip((t + 0.5 - start) / took, 0.0, 1.0))
