@@ -317,8 +317,7 @@ def test_law_is_adopted_and_explains_recording(tmp_path: Path, monkeypatch: pyte
 
 
 def test_noise_beside_a_movement_is_no_law() -> None:
-    shaky = Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),))
-    ws = workspace(shaky)
+    ws = workspace(Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),)))
     null, penalty = refit(ws, ()), float(np.log(ws.effective_size()))
     assert find_jitter(ws, null, penalty) is not None
     moved = workspace(Law('odd', 'psd', 'x1', (LawTerm('product', ('load_fy', 'load_fy'), 1e-8),)))
@@ -561,8 +560,10 @@ def test_ringing_that_nothing_explains_is_no_noise(hertz: float) -> None:
 @pytest.mark.slow
 def test_another_geometry_is_told_in_no_absurd_sizes() -> None:
     """Of small angles: two PSDs 30 cm away and a link five times as stiff would do the same, nearly."""
-    exact, linear = (ForwardModel(RIG, []).run(share * SET_UP).dots.T / share for share in (1.0, 1e-3))
-    o = recorded(17)
+    held = [(0, 0, 0), (0, -10, 0), (0, -10, -5.85), (12, 0, 0), (0, 0, 4), (0, -20, -11.7), (0, 0, 0)]
+    history = np.repeat(np.array(held, dtype=np.float64), 3000, axis=0)
+    exact, linear = (ForwardModel(RIG, []).run(share * history).dots.T / share for share in (1.0, 1e-3))
+    o = Observation('x', RIG, RigSimulator(RIG, 17).step(history).counts * RIG.converter.volts_per_count, history)
     o.volts[:, [0, 1, 3, 4]] += (linear - exact) / RIG.amplifier.sensitivity
     discovery = found_in(o)
     assert (discovery.verdict, discovery.effects) == ('unknown_effect', ())

@@ -238,8 +238,8 @@ def test_a_gauge_is_searched_beside_constant_columns(tmp_path: Path, rest: str, 
     """Readings that are exactly as simulated are no measurement; nothing is held against them."""
     lines = ['load_fx,load_fy,load_tz,ref_dx,ref_dy,ref_theta']
     for mass in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6):
-        load, cells = ['0'] * 3, [rest] * 3
-        load[axis], cells[axis] = f'{-9.81 * mass}', f'{-31.6e-3 * min(mass, 1.2):.6f}'
+        load, cells = ['0'] * 3, ['0'] * 3
+        load[axis], cells[axis], cells[axis - 1] = f'{-9.81 * mass}', f'{-31.6e-3 * min(mass, 1.2):.6f}', rest
         lines.append(','.join([*load, *cells]))
     (tmp_path / 'beam.csv').write_text('\n'.join(lines) + '\n')
     channel, reported = ('ref_dx', 'ref_dy', 'ref_theta')[axis], list[str]()
@@ -247,7 +247,9 @@ def test_a_gauge_is_searched_beside_constant_columns(tmp_path: Path, rest: str, 
     assert [f'{channel} is the same in rows 7 to 9 under different loads' in words for words in reported] == [True]
     assert discovery.verdict in ('effects_found', 'unknown_effect')
     assert 0.0 < discovery.gap_before < 0.1 * 1e6
-    assert [gaps[0] > 0.0 for gaps in discovery.per_channel.values()] == [i == axis or rest > '0' for i in range(3)]
+    assert [gaps[0] > 0.0 for gaps in discovery.per_channel.values()] == [
+        i == axis or (rest > '0' and i == (axis - 1) % 3) for i in range(3)
+    ]
 
 
 TABLE_LOADS = np.array(
