@@ -563,7 +563,7 @@ def test_another_geometry_is_told_in_no_absurd_sizes() -> None:
     held = [(0, 0, 0), (0, -10, 0), (0, -10, -5.85), (12, 0, 0), (0, 0, 4), (0, -20, -11.7), (0, 0, 0)]
     history = np.repeat(np.array(held, dtype=np.float64), 3000, axis=0)
     exact, linear = (ForwardModel(RIG, []).run(share * history).dots.T / share for share in (1.0, 1e-3))
-    o = Observation('x', RIG, RigSimulator(RIG, 17).step(history).counts * RIG.converter.volts_per_count, history)
+    o = observe(RIG, 17, history=history)
     o.volts[:, [0, 1, 3, 4]] += (linear - exact) / RIG.amplifier.sensitivity
     discovery = found_in(o)
     assert (discovery.verdict, discovery.effects) == ('unknown_effect', ())
