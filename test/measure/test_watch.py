@@ -129,7 +129,7 @@ def test_a_bump_is_reported_with_its_time_channel_and_size(way: float) -> None:
     assert alarm.channel == 'x1'
     assert alarm.shift == pytest.approx(5e-6 * way, abs=0.3e-6)
     assert alarm.since_ns / 1e9 == pytest.approx(10.0, abs=0.6 if way > 0.0 else 0.2)
-    assert alarm.observed_ns / 1e9 - 10.0 < 6.0
+    assert 3.0 < alarm.observed_ns / 1e9 - 10.0 < 6.0
     # Of two means of four windows, which are means of 25 blocks.
     assert alarm.sd == pytest.approx(NOISE / 5.0 * 0.5**0.5, rel=0.4)
     assert alarm.sigmas > 20.0
@@ -149,8 +149,8 @@ def test_a_load_that_is_noted_again_changes_nothing() -> None:
 
 
 def test_base_line_tolerance_is_0_2_percent_of_motion() -> None:
-    """A link that moved by 2 mm, without a known load: 3 um are a sound rig's, 9 um are not."""
-    for wrong, alarm in ((1.5e-6, False), (6e-6, True)):
+    """A link that moved by 2 mm, without a known load: 3 um are a sound rig's, 7 um are not."""
+    for wrong, alarm in ((1.5e-6, False), (3.5e-6, True)):
         fed = Fed()
         fed.run(8.0, under(0.0, 0.0))
         longer = wrong * np.array([1.0, 1.0, -1.0, -1.0])
@@ -219,9 +219,9 @@ def test_what_comes_back_ends_the_alarm_and_a_zero_too() -> None:
     fed.load(0.0, 0.0)
     fed.run(8.0, REST)
     fed.run(8.0, REST + X1)
-    assert alarmed(fed)
-    fed.run(20.0, REST)
-    assert not alarmed(fed)
+    for seconds, there in ((8.0, True), (12.0, False)):
+        fed.run(seconds, REST)
+        assert alarmed(fed) is there
     fed.run(8.0, REST + X1)
     assert fed.watch.alarms == 2
     fed.watch.changed(records.ParameterChange(0, 0, (('state.held_twist', (0.0, 0.0, 0.0)),)), RIG)

@@ -443,6 +443,7 @@ class Clockwork(MadeUp):
         self.rests.append(rest)
 
     def read(self, timeout: float) -> Received:
+        self.asked_s = timeout
         if self.given >= 40:
             raise SourceEndedError('forty are enough')
         self.passed_s = max(self.passed_s, 1e-3 * (self.given + 1))
@@ -459,7 +460,7 @@ def test_samples_gather_except_the_last_of_a_block(rig: Rig, monkeypatch: pytest
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
     monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), 'sleep': source.sleep}))
     run = Run(rig)
-    assert numbers(take(run.acquisition, 40)) == list(range(40))
+    assert (numbers(take(run.acquisition, 40)), source.asked_s) == (list(range(40)), 0.1)
     run.acquisition.stop()
     if clock is Clock.HOST:
         # Whose samples are as old as their reading.

@@ -81,7 +81,7 @@ def test_a_tone_lasts_until_it_is_below_twelve_times_the_floor() -> None:
     for um, hz, stays in ((0.33, 87.0, 1), (0.33, 93.0, 0), (0.24, 87.0, 1), (0.2, 87.0, 0), (0.33, 90.0, 1)):
         moving = noise(1) + um * 1e-6 * tone(87.0)[:, None]
         assert not moving_tones(moving, noise(2))
-        counts = [len(moving_tones(moving, noise(2), **{past: (hz / RATE,)})) for past in ('known', 'candidates')]
+        counts = [len(moving_tones(moving, noise(2), ALL, **{past: (hz / RATE,)})) for past in ('known', 'candidates')]
         assert counts == [stays, (um, hz) == (0.33, 87.0)]
     for um, hz in ((0.45, 87.0), (0.55, 498.0)):  # The last bin but one.
         assert moving_tones(noise(1) + um * 1e-6 * tone(hz)[:, None], noise(2))
