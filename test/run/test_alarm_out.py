@@ -100,8 +100,7 @@ def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Se
     output = tmp_path / 'it is; $(kept)'
     out, stated = forwarded(python(KEEP, str(output)), server.url)
     expected = finding(ALARM, {'device': 'abc'})
-    assert json.loads(output.read_text()) == expected
-    assert [json.loads(body) for body in server.got] == [expected]
+    assert (json.loads(output.read_text()), [json.loads(body) for body in server.got]) == (expected, [expected])
     assert stated == []
     assert (out.sent, out.failed) == (2, 0)
     assert expected['since'] == '2023-11-14T22:13:20.250Z'
