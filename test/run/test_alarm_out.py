@@ -75,7 +75,7 @@ def server() -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, 'PAUSES_S', (0.0, 0.0))
+    monkeypatch.setattr(module, 'PAUSES_S', [0.0] * len(module.PAUSES_S))
     monkeypatch.setenv('no_proxy', '127.0.0.1')
 
 
