@@ -626,7 +626,7 @@ def test_a_board_of_tiny_squares_costs_a_bounded_time(square: int) -> None:
 
 @pytest.mark.parametrize(('stripes', 'status'), [(480, Status.MISSING), (530, Status.CLUTTERED)])
 def test_too_many_outlines_are_a_reason(stripes: int, status: Status) -> None:
-    stripe = np.repeat(np.arange(stripes, dtype=np.uint8) % 2 * np.uint8(255), 3)
+    stripe = np.repeat(np.arange(stripes, dtype=np.uint8) % 2 * np.uint8(255), 5)
     with pytest.raises(NoPoseError) as rejected:
         find_discs(np.tile(stripe, (2000, 1)), 3.0)
     assert rejected.value.status is status
