@@ -78,6 +78,9 @@ def test_jitter_of_less_than_half_a_step_makes_no_losses(tmp_path: Path) -> None
     times = [seconds(round((10 + i + j) * STEP)) for i, j in enumerate(jitter)]
     recording = open_recording(write(tmp_path / 'a.csv', *rows(times)))
     assert recording.samples['seq'].tolist() == list(range(20_000))
+    for late, number in ((0.49, 100), (0.51, 101)):
+        times = [seconds(round((10 + i + late * (i == 100)) * STEP)) for i in range(101)]
+        assert open_recording(write(tmp_path / f'{late}.csv', *rows(times))).samples['seq'][-1] == number
 
 
 def test_the_rate_can_be_given(tmp_path: Path) -> None:
