@@ -254,8 +254,6 @@ def test_a_robot_that_does_not_run_holds_the_offsets(launch: Launch, peer: Any) 
         stated = len(node.text)
         scale, active = (0.0, True) if 'speed' in why else (1.0, False)
         # A protective stop while the load changes: the arm must not be asked to leap when it ends.
-        # Both changes together move no offset by half of follow_error: until the stop is known,
-        # joints that do not follow would be another reason to hold, which only ~/enable ends.
         plant.stands = True
         plant.arm.force *= 1.2
         peer.until(lambda stated=stated, why=why: f'run: {why}' in node.text[stated:], why)

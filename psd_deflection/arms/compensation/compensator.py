@@ -51,6 +51,8 @@ ARRIVED_SHARE = 0.01
 """What was sent has arrived if the controller tells it within this share of ``follow_error``."""
 UNSEEN_SHARE = 0.1
 """Of what all offsets do to the end effector, what those of unverified joints may do."""
+STOP_LATE_S = 1.0
+"""A robot tells by this time at the latest that it does not run, s."""
 FOREIGN = 1e-6
 """An offset that the controller tells is one from here on, rad or m."""
 FOREIGN_S = 1.0
@@ -142,6 +144,8 @@ class Compensator:
         self._anchor: tuple[FloatArray, FloatArray] | None = None
         self._away_t: float | None = None
         self._stop = self._broken = ''
+        # For how long it was so at the last :meth:`watch`.
+        self._broken_s = 0.0
         self._other_publisher = False
         self._last: Observed | None = None
         self._last_now = -math.inf
@@ -213,12 +217,16 @@ class Compensator:
         """Hold for as long as ``why`` is not '': the robot does not run, or, with ``other_publisher``, somebody else
         commands it.
 
-        While another publisher does, offsets that the controller still has after we fell silent are not taken back
-        either.
+        Joints that did not follow for ``STOP_LATE_S`` before that stood already. While another publisher commands,
+        offsets that the controller still has after we fell silent are not taken back either.
         """
         if self._stop and not why and self._fault == self._stop:
             # That is over. What it waits for now is what comes next, or does not come.
             self._fault = AWAITED
+        if why and not self._stop:
+            self.response.forget_motion()
+            if not other_publisher and self._broken_s <= STOP_LATE_S:
+                self._broken = ''
         self._stop, self._other_publisher = why, other_publisher
 
     def controller_has(self, now: float, values: FloatArray) -> None:
@@ -237,7 +245,9 @@ class Compensator:
         before, then = self._joints, self._joints_t
         self._joints, self._joints_t = observed, now - max(age, 0.0)
         self._at_joints = self._offsets
-        wrong = self.response.add(now, observed, self._offsets, self.settings.follow_error, self._arrived(now))
+        wrong = None
+        if not self._stop:
+            wrong = self.response.add(now, observed, self._offsets, self.settings.follow_error, self._arrived(now))
         if wrong is not None and self._speaks and not self._dry:
             self._broken = self._broken or self.response.wrong(self.arm.names, wrong)
         if before is None:
@@ -298,8 +308,9 @@ class Compensator:
             self._unready = self._begin(now)
         self._foreign = self._look_for_foreign(now)
         self._give_up(now)
-        elapsed = 0.0 if self._moved_t is None else min(max(now - self._moved_t, 0.0), LONGEST_S)
-        self._moved_t = now
+        passed = 0.0 if self._moved_t is None else max(now - self._moved_t, 0.0)
+        elapsed, self._moved_t = min(passed, LONGEST_S), now
+        self._broken_s = self._broken_s + passed if self._broken else 0.0
         if not self.enabled:
             self._wanted = np.zeros(len(self._offsets))
         elif self._fault:

@@ -63,6 +63,14 @@ class JointResponse:
         self._right_t = math.inf
         self.slopes, self.half_widths = np.full_like(self.slopes, np.nan), np.full_like(self.slopes, np.nan)
 
+    def forget_motion(self) -> None:
+        """Forget the motion of now and the slopes that were wrong: the robot stood, perhaps since before it said so."""
+        wrong = list(self.candidates)
+        self.slopes[wrong] = self.half_widths[wrong] = math.nan
+        self.candidates.clear()
+        self._rows.clear()
+        self._restart()
+
     def known(self) -> npt.NDArray[np.bool_]:
         """(n,) bool: whether the slope of each joint was measured, and is right."""
         right = self.half_widths <= KNOWN_WITHIN

@@ -605,12 +605,19 @@ def test_controller_restarted_at_zero_gets_no_step(arm: Arm) -> None:
     assert loop.step() <= 1.0 + 1e-9
 
 
-def test_a_stop_that_is_over_is_no_reason_any_more(arm: Arm) -> None:
-    loop = following(arm)
+@pytest.mark.parametrize(('late', 'after'), [(0.9, State.FOLLOWING), (1.1, State.HOLDING)])
+def test_a_robot_may_report_its_stop_a_second_late(arm: Arm, late: float, after: State) -> None:
+    loop = Loop(arm, takeover=True, applies=0.0)
+    loop.compensator.enable(True)
+    loop.run(1.0)
+    loop.plant.force = PAYLOAD
+    assert loop.run(0.58).why == 'the joints do not move with the offsets'
+    loop.run(late)
     loop.compensator.stop('the robot does not run')
-    assert loop.run(0.1).why == 'the robot does not run'
+    loop.run(0.3)
+    loop.applies = 1.0
     loop.compensator.stop('')
-    assert loop.send(loop.t + 1.0).why == 'no deflection for 0.08 s'
+    assert loop.run(3.0).state is after
 
 
 def test_switch_off_in_silence_returns_offsets_later(arm: Arm) -> None:
@@ -924,6 +931,7 @@ def test_it_holds_while_it_is_stopped(arm: Arm, why: str) -> None:
     assert (command.state, command.why) == (State.HOLDING, why)
     assert np.array_equal(command.offsets, before)
     loop.compensator.stop('')
+    assert loop.send(loop.t + 1.0).why == 'no deflection for 0.08 s'
     assert loop.run(0.6).state is State.FOLLOWING
 
 
