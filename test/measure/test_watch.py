@@ -374,8 +374,7 @@ def test_an_alarm_is_that_of_a_second_reckoning(shift: float) -> None:
     assert (alarm.shift, alarm.sd) == pytest.approx((y1.shift, y1.sd), rel=1e-9)
     assert alarm.since_ns + 20_000_000 == 500_000_000 * y1.since
     assert alarm.observed_ns + 20_000_000 == 500_000_000 * (y1.observed + 1)
-    assert x1.since == y1.since
-    assert ended == max(x1.ended, y1.ended)
+    assert (x1.since, ended) == (y1.since, max(x1.ended, y1.ended))
     # Which scatter is usual is known after four windows.
     assert (fed.watch.windows, fed.watch.spoilt) == (ended + 1, 3 + 1)
 
