@@ -243,12 +243,10 @@ LIMITS = (1e-4, 2e-4, 3e-3)
 def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> None:
     rows = _certified(certificate, limits=LIMITS).result_rows()
     head, *rest = rows
-    assert len(head) == 1 + 6 * 3 + 2
-    assert head[1:4] == ['ΔX µm', 'ΔY µm', 'θ mdeg']
+    assert (len(head), head[1:4]) == (1 + 6 * 3 + 2, ['ΔX µm', 'ΔY µm', 'θ mdeg'])
     verdicts = _certified(certificate, limits=LIMITS).verdicts
     for n, (row, message) in enumerate(zip(rest, certificate.stated, strict=True)):
-        assert row[0] == str(n + 1)
-        assert len(row) == len(head)
+        assert (row[0], len(row)) == (str(n + 1), len(head))
         parts = (certificate.poses[n], certificate.as_found[n], message.standard)
         numbers = [scale * v for part in parts for scale, v in zip(SCALES, part.tolist(), strict=True)]
         assert [float(v) for v in row[1:10]] == pytest.approx(numbers, abs=6e-4)

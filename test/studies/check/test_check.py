@@ -198,8 +198,7 @@ def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> No
     names = ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')
     rotated = np.column_stack([sign * volts[:, names.index(of)] for of, sign in (wiring[n] for n in names)])
     checkup = checked(rotated, loads, rig)
-    assert checkup.verdict == WRONG
-    assert dict(checkup.values) == lines_of(wiring)
+    assert (checkup.verdict, dict(checkup.values)) == (WRONG, lines_of(wiring))
 
 
 def test_uninformative_loads_or_gaps_cannot_tell() -> None:
@@ -397,8 +396,7 @@ def test_quantisation_noise_is_step_over_root_12() -> None:
     (finding,), lines = shared_findings.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)
     assert (finding.name, finding.where, finding.value) == ('noise_level', 'x1 y1 x2 y2', 3.457)
     assert finding.evidence == pytest.approx(math.log(3.45678))
-    assert lines == {'amplifier.noise': 6.9e-3}
-    assert finding.fix == 'amplifier.noise: 0.0069'
+    assert (lines, finding.fix) == ({'amplifier.noise': 6.9e-3}, 'amplifier.noise: 0.0069')
     # Steps that are finer than the file's make no less.
     alone = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
     (same,), _ = shared_findings.noise_findings(RIG, np.full(4, 3.0 * alone), np.zeros((2, 2)))

@@ -71,7 +71,7 @@ def verdict(known: Rig, guide: Guide) -> Checkup:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('number', range(0, 128, 18))
-@pytest.mark.parametrize('clumsy', [0.3])
+@pytest.mark.parametrize('clumsy', [math.tan(math.radians(20.0))])
 def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     wiring, known = WIRINGS[number], load_rig()
     world = rig_from_values(parameters(wiring, Wiring()))
@@ -79,8 +79,7 @@ def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     assert guide.phase is Phase.DONE
     assert sum(text.startswith('Got it: ') for text in message) == 3
     checkup = verdict(known, guide)
-    assert checkup.verdict == (WRONG if number else RIGHT)
-    assert dict(checkup.values) == parameters(wiring, Wiring())
+    assert (checkup.verdict, dict(checkup.values)) == (WRONG if number else RIGHT, parameters(wiring, Wiring()))
     # A hand's turn shifts the tip, so exchanged PSDs look like a turn the other way; that is said.
     if wiring == Wiring(exchanged=True):
         assert checkup.findings[0].equivalent == ('load_sign of tz',)
@@ -165,8 +164,7 @@ def test_rest_takes_2_s_and_push_and_release_0_6_s() -> None:
         assert len(guide.pushes) == number
     assert fed.at(Phase.DONE)
     assert (guide.number, guide.prompt()) == (3, 'Done.')
-    assert fed.feed(FAR) == ['']
-    assert [p.loads for p in guide.pushes] == [('fx',), ('fy',), ('tz',)]
+    assert (fed.feed(FAR), [p.loads for p in guide.pushes]) == ([''], [('fx',), ('fy',), ('tz',)])
     assert [p.only_twist for p in guide.pushes] == [False, False, True]
     assert not any(p.sized for p in guide.pushes)
     assert [p.expected.tolist() for p in guide.pushes] == [[-1, 0, -1, 0], [0, -1, 0, -1], [0.07, 0, 0, 0.1]]
@@ -326,8 +324,7 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     shown: list[float] = []
     world = load_rig(overrides={'psd_1.axes': ['-y', 'x'], 'psds_exchanged': True})
     checkup = run_guided(load_rig(), world, texts(logged.append), lambda guide: shown.append(guide.progress))
-    assert checkup.verdict == WRONG
-    assert dict(checkup.values) == {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']}
+    assert (checkup.verdict, dict(checkup.values)) == (WRONG, {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x']})
     prompts = [text[:12] for text in logged if text.startswith(('Leave', '1 of', '2 of', '3 of', 'Let go'))]
     assert prompts == ['Leave the li', '1 of 3: Push', 'Let go.', '2 of 3: Push', 'Let go.', '3 of 3: Turn', 'Let go.']
     assert max(shown) > 0.9

@@ -384,8 +384,7 @@ def test_channel_below_a_tenth_of_every_push_is_dead() -> None:
 def test_stuck_channel_is_reported_once_without_wiring() -> None:
     dead = replace(push_of('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
     checkup = checked([dead, push_of('fy')], of_levels(stuck=('x1', 'sum2')))
-    assert of(checkup) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
-    assert checkup.verdict == WRONG
+    assert (of(checkup), checkup.verdict) == ([('stuck_channel', 'x1'), ('stuck_channel', 'sum2')], WRONG)
     rotated = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push_of(load, 9.80665, rotated) for load in ('fx', 'fy', 'tz')]
     assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
@@ -395,8 +394,7 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     wiring = Wiring(False, (('-x', 'y'), ('x', 'y')))
     three = [push_of(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')]
     checkup = checked(three)
-    assert of(checkup) == [('channel_sign', 'x1')]
-    assert dict(checkup.values) == {'psd_1.axes': ['-x', 'y']}
+    assert (of(checkup), dict(checkup.values)) == ([('channel_sign', 'x1')], {'psd_1.axes': ['-x', 'y']})
     # By the file a push along X is opposite on x1, which leaves all of it; one turn is opposite, too.
     assert checkup.findings[0].evidence == pytest.approx(1.0 + 1.0 - 0.0, abs=0.7)
     assert checkup.findings[0].evidence > 1.0
@@ -515,8 +513,7 @@ def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:
     assert checked(pushes, of_levels(noise), rig=rig).findings == ()
     noise[4] = 9e-3
     checkup = checked(pushes, of_levels(noise), rig=rig)
-    assert of(checkup) == [('noise_level', 'x1')]
-    assert dict(checkup.values) == {'psd_1.noise': [9e-3, 2e-3]}
+    assert (of(checkup), dict(checkup.values)) == ([('noise_level', 'x1')], {'psd_1.noise': [9e-3, 2e-3]})
 
 
 @pytest.mark.parametrize(

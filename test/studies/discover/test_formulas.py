@@ -357,14 +357,12 @@ def test_what_is_known_of_a_recording_is_reported() -> None:
     assert (coverage.name, coverage.value, coverage.evidence) == ('load_coverage', 150 / 1200, 150 / 1200)
     assert 'its first 0.10 s and its last 0.05 s' in coverage.fix
     gone = np.isnan(cleaned.volts).all(axis=1)
-    assert np.flatnonzero(gone).tolist() == [*range(100), *range(1150, 1200)]
-    assert cleaned.digest == reported.hashed()
+    assert (np.flatnonzero(gone).tolist(), cleaned.digest) == ([*range(100), *range(1150, 1200)], reported.hashed())
     for unknown, gone_samples in (((100, 0), range(100)), ((0, 100), range(1100, 1200))):
         half, (finding,) = clean(dataclasses.replace(o, unknown_load=unknown), ())
         assert finding.value == pytest.approx(100 / 1200)
         assert np.flatnonzero(np.isnan(half.volts).all(axis=1)).tolist() == list(gone_samples)
     # Up to a twentieth is left out and not told; and what is whole stays as it is.
     quiet, findings = clean(dataclasses.replace(o, unknown_load=(30, 30)), ())
-    assert findings == []
-    assert np.isnan(quiet.volts).all(axis=1).sum() == 60
+    assert (findings, np.isnan(quiet.volts).all(axis=1).sum()) == ([], 60)
     assert clean(o, ())[0] is o

@@ -101,8 +101,7 @@ def test_references_without_samples_are_left_out(problem: ValidateProblem) -> No
     reference = np.concatenate([np.zeros((7, 3)), problem.reference])
     sd = np.concatenate([np.zeros((7, 3)), np.ones((90, 3))])
     validation = validate(replace(problem, t=t, reference=reference, sd=sd, align=False))
-    assert validation.excluded == 7
-    assert validation.t.tolist() == problem.t.tolist()
+    assert (validation.excluded, validation.t.tolist()) == (7, problem.t.tolist())
     assert validation.reference.tolist() == problem.reference.tolist()
     assert validation.estimates['exact'].shape == (90, 3)
     assert validation.covered == (1.0, 1.0, 1.0)
@@ -134,8 +133,7 @@ def test_a_solver_that_answers_too_rarely_is_not_judged(problem: ValidateProblem
     fewer = validate(replace(problem, align=False, t=problem.t[:20], reference=problem.reference[:20]))
     assert [a.bias for a in validation.agreements['wls']] == pytest.approx([a.bias for a in fewer.agreements['exact']])
     validation = validate(rarely(19))
-    assert list(validation.agreements) == ['exact']
-    assert list(validation.estimates) == ['exact', 'wls']
+    assert (list(validation.agreements), list(validation.estimates)) == (['exact'], ['exact', 'wls'])
     # The solver of the rig itself: nothing is said about its cover.
     rare = rarely(19)
     validation = validate(replace(rare, solvers={'wls': rare.solvers['wls'], 'exact': first_three}))
@@ -440,8 +438,7 @@ def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
 )
 def test_offset_removal_is_reported_if_offset_exists(offset: Offset, applied: bool, words: str | None) -> None:
     message = replace(PLAIN, offset=offset, applied=applied).sentences()
-    assert message[3] == offset.sentence
-    assert message[4:] == ([] if words is None else [words])
+    assert (message[3], message[4:]) == (offset.sentence, [] if words is None else [words])
 
 
 def test_coverage_is_reported_if_reference_has_sd() -> None:
@@ -488,8 +485,6 @@ def test_programs_get_si_units() -> None:
     assert offset['value'] == 0.0123
     assert offset['interval'] == pytest.approx((0.0123 - 0.196e-3, 0.0123 + 0.196e-3))
     assert (offset['determined'], offset['applied'], offset['unit']) == (True, False, 's')
-    assert offset['sentence'] == STAMPED_LATE.sentence
-    assert list(tree['solvers']) == ['exact', 'wls']
+    assert (offset['sentence'], list(tree['solvers'])) == (STAMPED_LATE.sentence, ['exact', 'wls'])
     assert [axis['unit'] for axis in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
-    assert tree['solvers']['wls']['dy']['bias'] == 1.5e-6
-    assert list(tree['covered']) == ['dx', 'dy', 'theta']
+    assert (tree['solvers']['wls']['dy']['bias'], list(tree['covered'])) == (1.5e-6, ['dx', 'dy', 'theta'])
