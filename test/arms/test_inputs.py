@@ -41,7 +41,7 @@ def test_a_speed_is_that_over_a_tenth_of_a_second(period: float) -> None:
         # It moves at 0.2 for a second, then stands; its encoder shakes by 0.1 mrad.
         known.notify(now, ['a'], [0.2 * min(now, 1.0) + 1e-4 * (n % 2)])
         speeds.append(known.measured(now)['a'].speed)
-    assert math.isnan(speeds[0])
+    assert next(n for n, s in enumerate(speeds) if s == s) * period == pytest.approx(max(0.1, period), abs=3e-3)
     assert speeds[round(1.0 / period) - 1] == pytest.approx(0.2, abs=2e-3)
     assert speeds[-1] < 2e-3
     # Told again after a silence, its speed is not known.

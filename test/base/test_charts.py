@@ -48,8 +48,7 @@ def test_the_same_array_is_there_once() -> None:
     assert len(content['columns']) == 3
     first, second = (panel['series'] for panel in content['panels'])
     assert [s['x'] for s in (*first, *second)] == [0, 0, 0]
-    assert second[0]['y'] == first[0]['y']
-    assert column(content, first[1]['y']).tolist() == [0.0, 1.0, 8.0, 27.0, 64.0]
+    assert (second[0]['y'], column(content, first[1]['y']).tolist()) == (first[0]['y'], [0.0, 1.0, 8.0, 27.0, 64.0])
 
 
 def test_what_is_declared_reaches_the_page() -> None:
@@ -95,8 +94,7 @@ def test_a_cloud_keeps_points_that_do_not_lie_on_each_other() -> None:
     content = reported(chart_of(x, y))
     at, drawn_y = (column(content, place) for place in (0, 1))
     assert 50 < len(at) < 300
-    assert np.sum(at == 10.0) == 1
-    assert drawn_y.max() == 7.0
+    assert (np.sum(at == 10.0), drawn_y.max()) == (1, 7.0)
     assert content['note'] == f'{len(at)} of 40000 points are drawn'
 
 
@@ -160,8 +158,7 @@ TABLE = Table(T, columns_of(np.arange(6.0).reshape(3, 2), ('a', 'b'), ('m', ''),
 def test_pandas_has_the_units() -> None:
     pytest.importorskip('pandas')
     frame = TABLE.to_pandas()
-    assert list(frame.index) == [0.0, 0.5, 1.0]
-    assert frame['b'].tolist() == [1.0, 3.0, 5.0]
+    assert (list(frame.index), frame['b'].tolist()) == ([0.0, 0.5, 1.0], [1.0, 3.0, 5.0])
     assert frame.attrs == {'path': 'somewhere', 'units': {'t': 's', 'a': 'm', 'b': ''}}
 
 

@@ -319,14 +319,12 @@ def test_an_existing_output_is_not_moved(folder: Path, monkeypatch: pytest.Monke
     for name in ('out.csv', 'none.csv'):
         assert main(['simulate', '--out', name]) == 130
         assert capsys.readouterr().err == 'psd-deflection: interrupted\n'
-    assert out.read_text() == 'mine'
-    assert list(folder.iterdir()) == [out]
+    assert (out.read_text(), list(folder.iterdir())) == ('mine', [out])
 
 
 @pytest.mark.skipif('discover' not in COMMANDS, reason='an optional room')
 def test_discover_without_input_leaves_no_folder(folder: Path, capsys: Capsys) -> None:
-    assert rejected(capsys, 'discover', CLEAN, '--out', 'found')[0] == 4
-    assert list(folder.iterdir()) == []
+    assert (rejected(capsys, 'discover', CLEAN, '--out', 'found')[0], list(folder.iterdir())) == (4, [])
 
 
 def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,8 +337,7 @@ def test_a_picture_is_whole_or_as_it_was(folder: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(os, 'fsync', Mock(side_effect=OSError(28, 'No space left on device')))
     with pytest.raises(RecordingError, match=r'^--out .*a\.png: cannot be written \(No space left on device\)$'):
         _report.save(b'newer', place)
-    assert sorted(folder.iterdir()) == [place, link]
-    assert place.read_bytes() == b'new'
+    assert (sorted(folder.iterdir()), place.read_bytes()) == ([place, link], b'new')
 
 
 def program(line: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -85,8 +85,7 @@ def test_the_estimates_of_all_are_one_table(archive: Path, capsys: pytest.Captur
 def test_what_differs_is_reported_of_each(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (archive / 'rig.yaml').write_text('/**:\n  ros__parameters:\n    amplifier: {sensitivity: 0.0006}\n')
     words = ['replay', 'archive/one.mcap', 'archive/two.mcap', '--compare', '--params-file', 'rig.yaml']
-    assert main(words) == 1
-    assert capsys.readouterr().out.count('DIFFERS') == 2
+    assert (main(words), capsys.readouterr().out.count('DIFFERS')) == (1, 2)
     # A rig file that is wrong is so for all: nothing is begun.
     (archive / 'rig.yaml').write_text('/**:\n  ros__parameters:\n    amplifier: {sensitivity: -1.0}\n')
     assert main(words) == 3
@@ -96,8 +95,7 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
     loads = 'steps:0,0,0;0,-10,-5.85;5,0,0;0,0,3:0.5'
     assert main(['simulate', '--reference', '--loads', loads, '--out', 'run.csv']) == 0
     words = ['calibrate', 'r*.csv', 'nowhere.csv', '--each', '--quiet']
-    assert main([*words, '--out', 'out']) == 8
-    assert [p.name for p in (archive / 'out').iterdir()] == ['run.csv']
+    assert (main([*words, '--out', 'out']), [p.name for p in (archive / 'out').iterdir()]) == (8, ['run.csv'])
     files = {p.name: p for p in (archive / 'out' / 'run.csv').iterdir()}
     assert set(files) == {'calibration.json', 'report.html', 'rig.yaml'}
     assert main([*words, '--out', 'rows.parquet']) == 8

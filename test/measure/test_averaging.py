@@ -61,8 +61,7 @@ def test_repeats_are_passed_over_and_counted() -> None:
     assert (cutter.add(*chunk_of([3])), cutter.add(*chunk_of([0, 1, 2]))) == ([], [])
     assert cutter.add(*chunk_of([])) == []
     (block,) = cutter.flush()
-    assert block.seq.tolist() == [0, 1, 2, 3]
-    assert cutter.repeated == 6
+    assert (block.seq.tolist(), cutter.repeated) == ([0, 1, 2, 3], 6)
 
 
 @given(

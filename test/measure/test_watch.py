@@ -129,7 +129,7 @@ def test_a_bump_is_reported_with_its_time_channel_and_size(way: float) -> None:
     assert alarm.channel == 'x1'
     assert alarm.shift == pytest.approx(5e-6 * way, abs=0.3e-6)
     assert alarm.since_ns / 1e9 == pytest.approx(10.0, abs=0.6 if way > 0.0 else 0.2)
-    assert alarm.observed_ns / 1e9 - 10.0 < 6.0
+    assert 3.0 < alarm.observed_ns / 1e9 - 10.0 < 6.0
     # Of two means of four windows, which are means of 25 blocks.
     assert alarm.sd == pytest.approx(NOISE / 5.0 * 0.5**0.5, rel=0.4)
     assert alarm.sigmas > 20.0
@@ -149,8 +149,8 @@ def test_a_load_that_is_noted_again_changes_nothing() -> None:
 
 
 def test_base_line_tolerance_is_0_2_percent_of_motion() -> None:
-    """A link that moved by 2 mm, without a known load: 3 um are a sound rig's, 9 um are not."""
-    for wrong, alarm in ((1.5e-6, False), (6e-6, True)):
+    """A link that moved by 2 mm, without a known load: 4 um are a sound rig's, 7 um are not."""
+    for wrong, alarm in ((1.5e-6, False), (2.5e-6, True)):
         fed = Fed()
         fed.run(8.0, under(0.0, 0.0))
         longer = wrong * np.array([1.0, 1.0, -1.0, -1.0])
@@ -219,9 +219,9 @@ def test_what_comes_back_ends_the_alarm_and_a_zero_too() -> None:
     fed.load(0.0, 0.0)
     fed.run(8.0, REST)
     fed.run(8.0, REST + X1)
-    assert alarmed(fed)
-    fed.run(20.0, REST)
-    assert not alarmed(fed)
+    for seconds, there in ((8.0, True), (12.0, False)):
+        fed.run(seconds, REST)
+        assert alarmed(fed) is there
     fed.run(8.0, REST + X1)
     assert fed.watch.alarms == 2
     fed.watch.changed(records.ParameterChange(0, 0, (('state.held_twist', (0.0, 0.0, 0.0)),)), RIG)
@@ -262,25 +262,25 @@ def test_without_a_known_load_only_the_base_line_is_watched() -> None:
     assert fed.watch.alarm.channel == 'base line of psd_1 and psd_2'
 
 
-@pytest.mark.parametrize(('share', 'alarm', 'decimation'), [(1.01, False, 1), (1.06, True, 1), (1.06, True, 7)])
-def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool, decimation: int) -> None:
-    fed = Fed(decimation=decimation)
+@pytest.mark.parametrize(('share', 'alarm', 'axis'), [(1.01, False, 1), (1.06, True, 1), (1.06, True, 0)])
+def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool, axis: int) -> None:
+    fed, way = Fed(decimation=(7, 1)[axis]), np.eye(2)[axis]
     fed.load(0.0, 0.0)
     fed.run(6.0, under(0.0, 0.0))
     # Noted less than three seconds before the next: its pose is not yet sure, so the one before it counts.
-    fed.load(0.0, -20.0)
-    fed.run(2.6, under(0.0, -20.0))
-    fed.load(0.0, -40.0)
-    fed.run(6.0, under(0.0, -40.0 * share))
+    fed.load(*(-20.0 * way))
+    fed.run(2.6, under(*(-20.0 * way)))
+    fed.load(*(-40.0 * way))
+    fed.run(6.0, under(*(-40.0 * share * way)))
     alarmed = fed.watch.alarm
     assert (alarmed is not None) == alarm
     if alarmed is not None:
-        assert alarmed.channel == 'dy'
-        assert alarmed.shift == pytest.approx(-40.0 * (share - 1.0) * COMPLIANCE[1], rel=0.05)
+        assert alarmed.channel == ('dx', 'dy')[axis]
+        assert alarmed.shift == pytest.approx(-40.0 * (share - 1.0) * COMPLIANCE[axis], rel=0.05)
         # Six of these are what is allowed: 5 um and 2 % of the movement.
-        assert alarmed.sd == pytest.approx((5e-6 + 0.02 * abs(40.0 * share * COMPLIANCE[1])) / 6.0, rel=0.01)
+        assert alarmed.sd == pytest.approx((5e-6 + 0.02 * abs(40.0 * share * COMPLIANCE[axis])) / 6.0, rel=0.01)
         # What the level under this load is does not end it, and it is not seen to end under another one.
-        fed.run(20.0, under(0.0, -40.0 * share))
+        fed.run(20.0, under(*(-40.0 * share * way)))
         assert fed.watch.alarm is alarmed
         fed.load(0.0, 0.0)
         fed.run(20.0, under(0.0, 0.0))
@@ -374,8 +374,7 @@ def test_an_alarm_is_that_of_a_second_reckoning(shift: float) -> None:
     assert (alarm.shift, alarm.sd) == pytest.approx((y1.shift, y1.sd), rel=1e-9)
     assert alarm.since_ns + 20_000_000 == 500_000_000 * y1.since
     assert alarm.observed_ns + 20_000_000 == 500_000_000 * (y1.observed + 1)
-    assert x1.since == y1.since
-    assert ended == max(x1.ended, y1.ended)
+    assert (x1.since, ended) == (y1.since, max(x1.ended, y1.ended))
     # Which scatter is usual is known after four windows.
     assert (fed.watch.windows, fed.watch.spoilt) == (ended + 1, 3 + 1)
 

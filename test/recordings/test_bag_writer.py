@@ -54,8 +54,7 @@ def test_an_independent_reader_gets_every_byte_that_was_written(tmp_path: Path) 
         types = {c.topic: c.msgtype for c in reader.connections}
         for connection, t_ns, raw in reader.messages():
             got.setdefault(connection.topic, []).append((t_ns, bytes(raw)))
-    assert len(got.pop(RIG)) == 1
-    assert got == expected
+    assert (len(got.pop(RIG)), got) == (1, expected)
     of_two = {t: kind for t, kind in TOPIC_TYPES.items() if t not in spot_topics(MOST_PSDS)[2:]}
     assert {t: types[t] for t in of_two} == of_two
     assert {c for c in types if c not in TOPIC_TYPES} == {'/link_tip/exact/deflection', '/link_tip/wls/deflection'}
@@ -108,8 +107,7 @@ def test_index_of_long_recording_is_complete(tmp_path: Path) -> None:
         assert len(summary.chunk_indexes) == 300
         for index in (summary.chunk_indexes[0], summary.chunk_indexes[-1]):
             f.seek(index.chunk_start_offset)
-            assert f.read(1)[0] == Opcode.CHUNK
-            assert sorted(index.message_index_offsets) == [1]
+            assert (f.read(1)[0], sorted(index.message_index_offsets)) == (Opcode.CHUNK, [1])
     assert [p.name for p in tmp_path.iterdir()] == ['a.mcap']
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import PsdDeflectionError, RecordingError
+from psd_deflection.base.foreign_tables import why_rate
 from psd_deflection.base.plugins import optional
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.loads import from_csv
@@ -151,6 +152,10 @@ def rejection(path: Path) -> str:
     assert why.startswith(str(path) if why else '')
     assert '\n' not in why
     return why
+
+
+def test_a_rate_is_from_5_to_20_000_samples_a_second() -> None:
+    assert [rate for rate in (4.9, 5.0, 20_000.0, 20_001.0) if not why_rate(Path('a'), 1, rate, 0.0)] == [5.0, 20_000.0]
 
 
 @pytest.mark.parametrize('name', CONVERTIBLE)

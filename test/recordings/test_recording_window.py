@@ -106,8 +106,7 @@ def test_parts_put_together_are_the_whole() -> None:
     assert all(sum(counts.get(name, 0) for counts in topics) <= count for name, count in full.topics().items())
     inner = parts[1].crop(0.25, 0.5).with_block_size(10)
     assert isinstance(inner, RecordingWindow)
-    assert len(inner.samples) == 250
-    assert inner.samples['seq'][0] == full.samples['seq'][750]
+    assert (len(inner.samples), inner.samples['seq'][0]) == (250, full.samples['seq'][750])
     assert {len(block.seq) for block in inner.blocks()} == {10}
 
 
@@ -545,8 +544,7 @@ def test_no_line_is_drawn_over_a_step_of_the_time_map() -> None:
 def test_a_recording_draws_itself(part: str) -> None:
     recording = psd_deflection.open(CLEAN).crop(1.0, 2.0)
     figure = recording.plot() if part == 'samples' else psd_deflection.replay(recording).plot()
-    assert len(figure.axes) == {'samples': 6, 'estimates': 3}[part]
-    assert figure._repr_png_()[:4] == b'\x89PNG'
+    assert (len(figure.axes), figure._repr_png_()[:4]) == ({'samples': 6, 'estimates': 3}[part], b'\x89PNG')
 
 
 def _spans(x: np.ndarray, y: np.ndarray) -> list[tuple[float, float]]:

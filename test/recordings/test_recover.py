@@ -182,8 +182,7 @@ def test_rotation_by_size_and_what_each_file_holds(tmp_path: Path) -> None:
         lone = open_recording(file)
         assert (lone.parameters, lone.hello, lone.changes) == (dict(rig.values), HELLO, [change])
     together = open_recording(tmp_path / 'run')
-    assert together.changes == [change]
-    assert [b.index for b in together.blocks()] == list(range(400))
+    assert (together.changes, [b.index for b in together.blocks()]) == ([change], list(range(400)))
     assert len(theirs(tmp_path / 'run')['/psd/samples']) == 400
 
 
@@ -235,16 +234,14 @@ def test_recover_rewrites_a_metadata_yaml_that_does_not_match(
     metadata.write_text(text)
     assert main(['info', str(folder)]) == 4
     assert '`psd-deflection recover` makes' in capsys.readouterr().err
-    assert main(['recover', str(folder)]) == 0
-    assert theirs(folder) == before
+    assert (main(['recover', str(folder)]), theirs(folder)) == (0, before)
     assert (folder / 'metadata.yaml.cut').read_text() == text
     # What describes it, and what rosbag2 compressed in its own way, stays.
     tree = yaml.safe_load(metadata.read_text())
     tree['rosbag2_bagfile_information'] |= {'compression_mode': 'message', 'relative_file_paths': ['run_0.mcap.zstd']}
     for valid in (metadata.read_text(), yaml.safe_dump(tree)):
         metadata.write_text(valid)
-        assert main(['recover', str(folder)]) == 0
-        assert metadata.read_text() == valid
+        assert (main(['recover', str(folder)]), metadata.read_text()) == (0, valid)
 
 
 def test_a_repair_that_fails_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

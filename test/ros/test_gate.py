@@ -16,8 +16,8 @@ from bench.campaign.attacked import NODES
 from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery
 from psd_deflection.base.log import INFO, WARNING
 from psd_deflection.ros.endpoints import qos
-from psd_deflection.ros.gate import MOST_A_SECOND, InputGate, frame_fault, quaternion_fault, stamp_fault
-from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic
+from psd_deflection.ros.gate import InputGate, frame_fault, quaternion_fault, stamp_fault
+from psd_deflection.ros.topics import HEARD, GraphTopic
 from test.ros.test_conformance import nodes_of_setup
 
 pytestmark = pytest.mark.ros
@@ -50,9 +50,11 @@ class Gated:
         )
 
 
-def heard_as(monkeypatch: pytest.MonkeyPatch, delivery: Delivery = KEPT, most_bytes: int = MOST_BYTES) -> None:
+ROW = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', KEPT)
+
+
+def heard_as(monkeypatch: pytest.MonkeyPatch, row: GraphTopic = ROW) -> None:
     """Give the topic a row."""
-    row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', delivery, most_bytes=most_bytes)
     monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row,))
 
 
@@ -71,21 +73,25 @@ def sender(peer: Any, delivery: Any = 50) -> Any:
     return publisher
 
 
+@pytest.mark.parametrize(
+    ('row', 'most'), [(ROW, 1_000_000), (ROW._replace(most_bytes=HEARD[MARK][0].most_bytes), 4096)]
+)
 def test_good_ones_are_taken_and_others_counted_and_reported(
-    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
+    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch, row: GraphTopic, most: int
 ) -> None:
-    heard_as(monkeypatch, most_bytes=1000)
+    heard_as(monkeypatch, row)
     gated.listen()
     publisher = sender(peer)
 
     def sent() -> bool:
-        for text in ('good', '', 'x' * 2000):
+        for text in ('good', '', 'x' * most):
             publisher.publish(String(data=text))
         return bool(gated.heard) and gated.gate.rejected[TOPIC] >= 2
 
     peer.until(sent, 'the messages')
     assert set(gated.heard) == {'good'}
-    assert set(gated.logged) == {f'{TOPIC}: rejected: empty', f'{TOPIC}: rejected: 2009 bytes: must be at most 1000'}
+    size = f'{most + 9} bytes: must be at most {most}'
+    assert set(gated.logged) == {f'{TOPIC}: rejected: empty', f'{TOPIC}: rejected: {size}'}
     assert set(gated.levels) == {WARNING}
     count, why = gated.gate.values()
     assert count == (f'messages rejected: {TOPIC}', str(gated.gate.rejected[TOPIC]))
@@ -119,10 +125,9 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
         return gated.gate.rejected[TOPIC] > 0
 
     peer.until(flooded, 'the end of the flood')
-    assert len(gated.heard) == MOST_A_SECOND
-    assert gated.gate.why[TOPIC] == f'more than {MOST_A_SECOND} messages a second'
+    assert (len(gated.heard), gated.gate.why[TOPIC]) == (2000, 'more than 2000 messages a second')
     gated.now += 1.0
-    peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
+    peer.until(lambda: not flooded() or len(gated.heard) > 2000, 'the next second')
 
 
 def test_a_volatile_publisher_gets_no_latched_subscription(
@@ -130,8 +135,8 @@ def test_a_volatile_publisher_gets_no_latched_subscription(
 ) -> None:
     """DDS would warn it of messages that do not come, while they do. One that keeps its message is heard, however late
     the gate listens."""
-    row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', Delivery(1))
-    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row, row._replace(delivery=LATCHED)))
+    rows = ROW._replace(delivery=Delivery(1)), ROW._replace(delivery=LATCHED)
+    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, rows)
     warned: list[Any] = []
     publisher = peer.node.create_publisher(
         String, TOPIC, 1, event_callbacks=PublisherEventCallbacks(incompatible_qos=warned.append)
@@ -153,7 +158,7 @@ def test_a_volatile_publisher_gets_no_latched_subscription(
 def test_unreliable_load_publisher_rejected_by_name(peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch) -> None:
     """It holds until the next: a lost one would be a wrong label of all that follows."""
     assert [topic for topic in INPUTS if HEARD[topic][0].delivery.reliable] == [LOAD, MARK]
-    heard_as(monkeypatch, HEARD[LOAD][0].delivery)
+    heard_as(monkeypatch, ROW._replace(delivery=HEARD[LOAD][0].delivery))
     gated.listen()
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     peer.until(lambda: gated.gate.rejected[TOPIC] > 0, 'the publisher that is best effort')

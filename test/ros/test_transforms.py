@@ -23,6 +23,7 @@ from psd_deflection.records import BlockStatus, DeflectionEstimate, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.ros.gate import robot_description
 from psd_deflection.ros.markers import RigMarkers, at_rest, moving
+from psd_deflection.ros.node import BaseNode
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.sinks import TransformPublisher, static_transforms, tip_transform, topics_of
 from psd_deflection.run.processing import RecordSink
@@ -232,6 +233,19 @@ URDF = '<robot name="arm"/>'
 def signals(domain: int) -> Iterator[Signals]:
     with ros('reader', ['--ros-args', '-r', '__ns:=/left']) as made:
         yield made
+
+
+class Bare(BaseNode[object]):
+    def declare(self) -> Any:
+        return None
+
+    def set_up(self) -> None: ...
+
+
+def test_diagnostics_are_published_each_second(signals: Signals) -> None:
+    bare = Bare('bare', texts(list[str]().append))
+    assert [timer.timer_period_ns for timer in bare.node.timers] == [1_000_000_000]
+    bare.leave()
 
 
 def test_what_was_published_before_is_heard(signals: Signals, peer: Any) -> None:

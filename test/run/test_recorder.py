@@ -253,8 +253,7 @@ def test_a_slow_disk_holds_up_nothing_and_is_counted(tmp_path: Path, monkeypatch
     go_on.set()
     run.stop()
     recording = open_recording(run.folder)
-    assert run.indices() == list(range(limit + 1))
-    assert [c.block for c in recording.changes] == [7]
+    assert (run.indices(), [c.block for c in recording.changes]) == (list(range(limit + 1)), [7])
 
 
 def test_flushed_messages_survive_a_missing_end(tmp_path: Path) -> None:
@@ -418,11 +417,9 @@ def test_estimates_flow_while_disk_hangs_at_start(live: Live, hanging_disk: Hang
     hanging_disk.go_on.set()
     folder = first.result(WAIT_S)
     assert folder is not None
-    assert second.result(WAIT_S) == folder
-    assert live.session.recorder.folder == folder
+    assert (second.result(WAIT_S), live.session.recorder.folder) == (folder, folder)
     live.flow()
-    assert live.record(False) == folder
-    assert blocks_of(folder) == list(range(3 * BLOCKS, 4 * BLOCKS))
+    assert (live.record(False), blocks_of(folder)) == (folder, list(range(3 * BLOCKS, 4 * BLOCKS)))
     assert main(['replay', str(folder), '--compare']) == 0
 
 
@@ -438,8 +435,7 @@ def test_estimates_flow_while_the_disk_hangs_in_a_recording(live: Live, hanging_
     live.flow()
     assert not ended.done()
     hanging_disk.go_on.set()
-    assert ended.result(WAIT_S) == folder
-    assert live.heard('recording ended') == f'recording ended: {folder}'
+    assert (ended.result(WAIT_S), live.heard('recording ended')) == (folder, f'recording ended: {folder}')
     assert blocks_of(folder) == list(range(BLOCKS, 3 * BLOCKS))
 
 
@@ -457,8 +453,7 @@ def test_estimates_flow_while_disk_hangs_at_end(live: Live, hanging_disk: Hangin
     assert live.record(False) == second
     assert not ended.done()
     hanging_disk.go_on.set()
-    assert ended.result(WAIT_S) == first
-    assert blocks_of(first) == list(range(BLOCKS, 2 * BLOCKS))
+    assert (ended.result(WAIT_S), blocks_of(first)) == (first, list(range(BLOCKS, 2 * BLOCKS)))
     assert blocks_of(second) == list(range(3 * BLOCKS, 4 * BLOCKS))
 
 
@@ -502,8 +497,7 @@ def test_a_start_that_hangs_can_be_ended(live: Live, hanging_disk: HangingDisk, 
     folder = again.result(WAIT_S)
     assert folder is not None
     live.flow()
-    assert live.record(False) == folder
-    assert list((tmp_path / 'bags').iterdir()) == [folder]
+    assert (live.record(False), list((tmp_path / 'bags').iterdir())) == (folder, [folder])
 
 
 def test_a_start_that_hangs_does_not_hold_up_the_end_of_the_run(live: Live, hanging_disk: HangingDisk) -> None:

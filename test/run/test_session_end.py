@@ -10,6 +10,7 @@ import re
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
@@ -32,6 +33,7 @@ from psd_deflection.records import DeflectionEstimate, RawChunk, Record
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run import processing as module
 from psd_deflection.run import realtime, recorder
+from psd_deflection.run import session as session_module
 from psd_deflection.run.arrivals import Arrival, Ended, ItemQueue
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.headless import run_headless, run_until_signal
@@ -212,6 +214,23 @@ def test_samples_behind_part_that_hangs_are_counted(
     held.go.set()
     session.processing.join(WAIT_S)
     assert not session.alive
+
+
+def test_a_run_that_is_behind_gets_three_seconds(
+    device: Any, rig: Rig, tmp_path: Path, sample: Sample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, held = run_of(rig, tmp_path, [])
+    device.send_frames(*(sample(seq) for seq in range(20)))
+    assert held.holds.wait(WAIT_S)
+    waited: list[float] = []
+    with monkeypatch.context() as slow:
+        slow.setattr(session_module, 'time', Mock(wraps=time, monotonic=lambda: sum(waited)))
+        slow.setattr(session.processing, 'join', waited.append)
+        slow.setattr(session.acquisition.queue, 'qsize', lambda: 1000 - len(waited))
+        session.close()
+    assert sum(waited) == pytest.approx(3.0, abs=0.6)
+    held.go.set()
+    session.processing.join(WAIT_S)
 
 
 def test_a_run_that_lost_nothing_here_ends_well(device: Any, rig: Rig, tmp_path: Path, sample: Sample) -> None:

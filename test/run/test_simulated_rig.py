@@ -13,7 +13,7 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import null_log
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.measure.steps import REACH_S, RecentDots
+from psd_deflection.measure.steps import RecentDots
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.recordings.replay.engine import replayed
 from psd_deflection.records import BlockStatus, DeflectionEstimate, Record, SpotMeans
@@ -115,7 +115,8 @@ def test_only_the_last_minute_is_kept() -> None:
     for index in range(10_000):
         dots = tuple((1e-3 * (index > 6_000) + 2e-7 * noise.standard_normal(4)).tolist())
         recent.put(SpotMeans(index * period_ns, index, dots, (5.0, 5.0), np.zeros((4, 4)), 20, 0, BlockStatus.OK, ''))
-    assert REACH_S / 0.02 < 4_000
+        if index == 8_500:
+            assert recent.step_ns() == pytest.approx(6_000.5 * period_ns, abs=0.1 * period_ns)
     assert recent.step_ns() is None
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,17 +105,16 @@ class RecordedRig(Machine):
             values = {
                 name: [*observed, *(v for v in beside[name] if v not in observed)] for name, observed in values.items()
             }
-        listed = candidates([*library, *more], self.recorded.physics, values)
-        if fit is None or not is_far_off(fit):
-            signatures = [(c, self.bank.get(c, ws)) for c in listed]
-        else:
-            # A large effect changes the signatures of the others.
-            signatures = signatures_beside(ws, listed, fit)
-        return Screen(ws, self._not_acquitted(ws, signatures, residual, fit))
+        listed = list(candidates([*library, *more], self.recorded.physics, values))
+        # A large effect changes the signatures of the others.
+        anew = signatures_beside(ws, listed, fit) if fit is not None and is_far_off(fit) else None
+        signatures = anew if anew is not None else ((c, self.bank.get(c, ws)) for c in listed)
+        most = sum(len(c.free) for c in listed)
+        return Screen(ws, self._not_acquitted(ws, signatures, residual, fit), most)
 
     def _not_acquitted(
-        self, ws: Workspace, signatures: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
-    ) -> list[tuple[Candidate, Columns]]:
+        self, ws: Workspace, signatures: Iterator[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
+    ) -> Iterator[tuple[Candidate, Columns]]:
         """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
         reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
         excess_chi_square, throughout = excess(ws, residual)
@@ -123,11 +122,11 @@ class RecordedRig(Machine):
             return signatures
         least = 2.0 * reading.allowed / (PART * excess_chi_square)
         # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.
-        return [
+        return (
             (c, columns)
             for c, columns in signatures
             if c.effect.stage not in STAGES or c.effect.name in SETUP or visible(ws, columns) < least
-        ]
+        )
 
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
         """By load case, channel and frequency band, and what it follows."""

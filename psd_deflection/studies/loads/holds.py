@@ -132,9 +132,10 @@ def implied_loads(
     more, rest = np.zeros((len(listed), 3)), np.full_like(moved, np.nan)
     # The ringing after a hold that was left out does not say which load it was.
     shown = [k for k, p in enumerate(listed) if there[p.first // size : p.last // size].any()]
-    for axis in range(3):
-        pulses = _pulses(rig, samples, [listed[k] for k in shown], axis)
-        columns = np.array([np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in pulses)])
+    d = rig.dynamics
+    modes = (d.bending_frequency, d.bending_damping_ratio), (d.torsion_frequency, d.torsion_damping_ratio)
+    bent, twisted = (_motion(rig, mode, samples, size, [listed[k] for k in shown]) for mode in modes)
+    for axis, columns in enumerate((bent, bent, twisted)):
         solution = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
         more[shown, axis] = solution[1:] / compliance[axis]
         rest[axis, there] = moved[axis, there] - solution @ columns[:, there]
@@ -169,18 +170,15 @@ def _held(listed: Sequence[Hold], samples: int, size: int, blocks: int) -> BoolA
     return np.asarray(inside[: blocks * size].reshape(blocks, size).all(axis=1))
 
 
-def _pulses(rig: Rig, samples: int, listed: Sequence[Hold], axis: int) -> list[FloatArray]:
-    """How the link moves, as a share, if a load acts in one of the holds after the first."""
-    d, period = rig.dynamics, 1.0 / rig.converter.sample_rate_hz
-    mode = (
-        (d.torsion_frequency, d.torsion_damping_ratio) if axis == 2 else (d.bending_frequency, d.bending_damping_ratio)
-    )
-    out = []
-    for p in listed:
+def _motion(rig: Rig, mode: tuple[float, float], samples: int, size: int, listed: Sequence[Hold]) -> FloatArray:
+    """(1 + k, m): an offset, and how the link moves, as a share, if a load acts in one of the holds after the first."""
+    out = np.ones((1 + len(listed), samples // size))
+    for row, p in zip(out[1:], listed, strict=True):
         acts = np.zeros(samples)
         if p.first > 0:
             acts[p.first : p.last] = 1.0
-        out.append(Filter(mode_coefficients(*mode, period))(acts))
+        response = Filter(mode_coefficients(*mode, 1.0 / rig.converter.sample_rate_hz))(acts)
+        row[:] = fine_means(response[None, :], size)[0]
     return out
 
 

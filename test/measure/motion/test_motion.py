@@ -72,12 +72,13 @@ def test_a_lost_laser_is_coasted_through_and_reported(operation: motion.Run) -> 
 
 
 @pytest.mark.slow
-def test_coasting_ends(operation: motion.Run) -> None:
+@pytest.mark.parametrize(('values', 'last'), [({}, 223), ({'filter_coast': 0.2}, 209)])
+def test_coasting_ends(operation: motion.Run, values: dict[str, object], last: int) -> None:
     dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
     dark.volts[4000:, 2] = 0.0
-    pipeline = Pipeline(motion.rig_of({'filter_coast': 0.2}))
+    pipeline = Pipeline(motion.rig_of(values))
     moved = through(pipeline, dark, range(300))
-    assert moved[-1].block == 209
+    assert moved[-1].block == last
     memory = pipeline.snapshot(pipeline.rig)
     assert memory is not None
     assert STATE not in dict(memory.values)

@@ -59,8 +59,7 @@ def test_outcomes_come_in_order_whatever_ends_first() -> None:
     outcomes = list(tasks.outcomes(length, NAMES, Later(3), lambda: ended.append(1)))
     assert [o.name for o in outcomes] == NAMES
     assert [o.value for o in outcomes] == [1, 3, None, 2, None, 4]
-    assert len(ended) == len(NAMES)
-    assert outcomes[2].error == 'rejected: no such recording'
+    assert (len(ended), outcomes[2].error) == (len(NAMES), 'rejected: no such recording')
     assert outcomes[4].error.startswith('defect: a defect of psd_deflection, ZeroDivisionError: division by zero; ')
 
 
@@ -78,8 +77,7 @@ def test_a_lost_worker_costs_only_what_it_worked_on() -> None:
     engine.submit = alone  # type: ignore[method-assign]
     outcomes = list(tasks.outcomes(length, ['a', 'bbb', 'cc', 'dddd', 'e'], engine))
     assert [o.value for o in outcomes] == [1, 3, None, 4, 1]
-    assert outcomes[2].error == 'cc: its worker was killed, twice; too little memory?'
-    assert engine.renewed == 3
+    assert (outcomes[2].error, engine.renewed) == ('cc: its worker was killed, twice; too little memory?', 3)
 
 
 def test_a_worker_that_is_lost_once_more_costs_nothing() -> None:
@@ -111,8 +109,7 @@ def test_results_that_wait_for_an_earlier_one_are_bounded() -> None:
 
     names = [str(i) for i in range(200)]
     work = tasks.outcomes(length, names, Slow())
-    assert next(work).name == '0'
-    assert len(given) == 4 + tasks.AHEAD
+    assert (next(work).name, len(given)) == ('0', 4 + tasks.AHEAD)
     assert [o.name for o in work] == names[1:]
 
 

@@ -141,8 +141,7 @@ def test_old_times_are_asked_of_the_level_that_still_has_them() -> None:
     made = filled((row(START_NS + s * SECOND, s * 1e-6) for s in range(400)), SMALL)
     assert window(made, 300, 400).width_ns == SECOND
     # The seconds reach back 150 s, the cells of ten 90 s, those of a minute three minutes.
-    assert window(made, 235, 245).width_ns == 60 * SECOND
-    assert len(window(made, 0, 100).columns['dx']) == 0
+    assert (window(made, 235, 245).width_ns, len(window(made, 0, 100).columns['dx'])) == (60 * SECOND, 0)
 
 
 def test_a_clock_that_is_set_back_leaves_what_lies_before() -> None:
@@ -155,8 +154,7 @@ def test_a_clock_that_is_set_back_leaves_what_lies_before() -> None:
     assert made.unsaved().marks == [(START_NS + 10 * SECOND, '[10]')]
     for level in (200, 20, 4):
         view = window(made, 0, 200, level)
-        assert view.columns['blocks'].sum() == 126
-        assert np.nanmax(view.columns['dx_high']) == np.float32(2e-3)
+        assert (view.columns['blocks'].sum(), np.nanmax(view.columns['dx_high'])) == (126, np.float32(2e-3))
     assert json.loads(made.answer(history.Asked(START_NS, START_NS + 200 * SECOND, 100)))['marks'] == [[10]]
 
 
@@ -197,8 +195,7 @@ def test_memory_is_taken_once_and_marks_are_bounded() -> None:
         made.mark(START_NS + k, f'[{k}]')
     assert made.bytes == before
     content = json.loads(made.answer(history.Asked(START_NS, START_NS + SECOND, 100)))
-    assert content['marks'][-1] == [history.MOST_MARKS + 699]
-    assert len(content['marks']) == history.SENT_MARKS
+    assert (content['marks'][-1], len(content['marks'])) == ([history.MOST_MARKS + 699], history.SENT_MARKS)
     assert content['marks_left_out'] == 2000 - history.SENT_MARKS
 
 

@@ -307,8 +307,7 @@ def test_the_hours_of_a_page_outlive_it(serve: Serve, tmp_path: Path, monkeypatc
     second = serve()
     until(lambda: bool(history_of(second, 400.0, points=40)['marks']))
     after = history_of(second, 400.0, points=40)
-    assert after['columns'] == before['columns']
-    assert column(after, 'blocks') == [500, 500, 500]
+    assert (after['columns'], column(after, 'blocks')) == (before['columns'], [500, 500, 500])
     assert [mark[1] for mark in after['marks']] == ['mark']
     # The seconds went with the run; ten of them are the finest that is kept.
     assert history_of(second, 40.0)['columns']['blocks'] == ''
@@ -321,6 +320,5 @@ def test_the_hours_of_a_page_outlive_it(serve: Serve, tmp_path: Path, monkeypatc
 def test_two_devices_never_share_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
     names = {device_file('history', serial, '.sqlite') for serial in ('A', 'A.', '../A', '', 'unknown', 'a' * 70)}
-    assert len(names) == 6
-    assert {path.parent for path in names} == {tmp_path / 'psd_deflection'}
+    assert (len(names), {path.parent for path in names}) == (6, {tmp_path / 'psd_deflection'})
     assert load_rig().monitor.history is True

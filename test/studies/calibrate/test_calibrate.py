@@ -388,13 +388,13 @@ def test_a_recording_that_reports_no_dark_level_is_rejected(
 
 
 def test_a_drift_is_rejected_if_it_moves_a_dot(nominal: Rig) -> None:
-    """2 mV of the sum are 2 µm at the edge; 2 mV of x are 1 µm of 2 % of the light."""
+    """1 mV of the sum are 1 µm at the edge; 2 mV of x are 0.02 µm with 2 % of the light."""
     ramp = np.linspace(-1e-3, 1e-3, 5000)
-    volts = white((3.0, -2.0, 0.12, -1.0, 0.5, 0.06))
-    volts[:, 0] += ramp
+    volts = white((3.0, -2.0, 0.12, -1.0, 0.5, 0.06), sigma=5e-4)
+    volts[:, [0, 5]] += ramp[:, None] * (1.0, 0.22)
     dark_levels([run_of(volts)], nominal)
-    volts[:, 5] += ramp
-    with pytest.raises(RecordingError, match=r'sum2 drifts with the laser off: by \+[12]\.\d\d mV in 5\.0 s, noise'):
+    volts[:, 5] += 0.08 * ramp
+    with pytest.raises(RecordingError, match=r'sum2 drifts with the laser off: by \+0\.[56]\d mV in 5\.0 s, noise'):
         dark_levels([run_of(volts)], nominal)
 
 

@@ -71,7 +71,7 @@ def verdict(known: Rig, guide: Guide) -> Checkup:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('number', range(0, 128, 18))
-@pytest.mark.parametrize('clumsy', [0.3])
+@pytest.mark.parametrize('clumsy', [math.tan(math.radians(20.0))])
 def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     wiring, known = WIRINGS[number], load_rig()
     world = rig_from_values(parameters(wiring, Wiring()))
@@ -79,8 +79,7 @@ def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     assert guide.phase is Phase.DONE
     assert sum(text.startswith('Got it: ') for text in message) == 3
     checkup = verdict(known, guide)
-    assert checkup.verdict == (WRONG if number else RIGHT)
-    assert dict(checkup.values) == parameters(wiring, Wiring())
+    assert (checkup.verdict, dict(checkup.values)) == (WRONG if number else RIGHT, parameters(wiring, Wiring()))
     # A hand's turn shifts the tip, so exchanged PSDs look like a turn the other way; that is said.
     if wiring == Wiring(exchanged=True):
         assert checkup.findings[0].equivalent == ('load_sign of tz',)

@@ -400,8 +400,7 @@ def test_mistake_with_effect_must_beat_effects_alone(of_effect: float, expected:
     else:
         plant = Plant(shown, without_noise((shown[length], total)) + noise())
     after = steps.search(begun(Library(plant)))
-    assert names(after.fit) == expected
-    assert after.comparison.first == (frozenset() if of_effect else FIRST)
+    assert (names(after.fit), after.comparison.first) == (expected, frozenset() if of_effect else FIRST)
     assert plant.first == FIRST
 
 

@@ -40,11 +40,12 @@ class Table(Plant):
     channels, units, cases = ('height',), ('mm',), ('table',)
     library = (SLOPE,)
     nuisance = (plant_effect('offset', EffectParameter('size', 'mm', -9.0, 9.0, 0.1, 'of all')),)
+    groups = 30
 
-    def __init__(self, seed: int, waves: float, noise: float = NOISE) -> None:
+    def __init__(self, seed: int, waves: float, noise: float = NOISE, count: int = 30) -> None:
         rng = np.random.default_rng(seed)
-        self.along, self.across = rng.uniform(0.0, 1.0, (2, 30))
-        self.error = noise * rng.standard_normal(30)
+        self.along, self.across = rng.uniform(0.0, 1.0, (2, count))
+        self.error = noise * rng.standard_normal(count)
         self.observed = 2.0 * self.along + waves * np.sin(9.0 * self.along) + self.error
 
     def measured(self) -> list[FloatArray]:
@@ -54,7 +55,7 @@ class Table(Plant):
         return {'along': [self.along], 'across': [self.across]}
 
     def parts(self) -> list[IntArray]:
-        return [np.arange(30)]
+        return [np.arange(len(self.along)) % self.groups]
 
     def simulate(self, model: Model) -> list[FloatArray]:
         slope = model.get('slope', {'size': 0.0})['size']
@@ -142,11 +143,14 @@ def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     np.testing.assert_allclose(again, residual, rtol=1e-6, atol=1e-9)
 
 
-def test_few_readings_report_no_function() -> None:
-    plant = Table(1, 1.0)
-    plant.observed[19:] = np.nan
-    assert smooth(plant) is None
-    assert smooth(Table(1, 1.0), {}) is None
+@pytest.mark.parametrize(
+    ('count', 'groups', 'there'),
+    [(30, 8, True), (30, 7, False), (20, 30, True), (19, 30, False), (150, 8, True), (151, 8, False)],
+)
+def test_few_or_many_readings_report_no_function(count: int, groups: int, there: bool) -> None:
+    plant = Table(1, 1.0, count=max(count, 30))
+    plant.observed[count:], plant.groups = np.nan, groups
+    assert ((smooth(plant) is not None), smooth(plant, {})) == (there, None)
 
 
 def test_shared_sizes_leave_the_likelihood_once() -> None:

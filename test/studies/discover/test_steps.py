@@ -392,6 +392,9 @@ def test_only_like_sizes_of_two_effects_are_compared() -> None:
         (first,) = coincidences(amplitudes(*two, ('z', 'V', size)), physics)
         assert first.odds == pytest.approx(tie.odds / pairs)
     assert coincidences(amplitudes(*two, finite=True), physics) == []
+    # Odds of 21 and of 18 to 1.
+    tied, apart = (coincidences(amplitudes(two[0], ('y', 'V', size)), physics) for size in (0.5044, 0.5046))
+    assert (len(tied), apart) == (1, [])
     # The more pairs there are, the likelier one of them agrees.
     three = coincidences(amplitudes(*two, ('z', 'V', 0.1)), physics)
     assert [t.odds for t in three] == pytest.approx([tie.odds / 3.0])

@@ -436,8 +436,7 @@ def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
 )
 def test_offset_removal_is_reported_if_offset_exists(offset: Offset, applied: bool, words: str | None) -> None:
     message = replace(PLAIN, offset=offset, applied=applied).sentences()
-    assert message[3] == offset.sentence
-    assert message[4:] == ([] if words is None else [words])
+    assert (message[3], message[4:]) == (offset.sentence, [] if words is None else [words])
 
 
 def test_coverage_is_reported_if_reference_has_sd() -> None:

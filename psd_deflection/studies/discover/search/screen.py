@@ -152,11 +152,14 @@ def signature_columns(
     return out
 
 
-def signatures_beside(workspace: Comparison, listed: Iterable[Candidate], fit: Fit) -> list[tuple[Candidate, Columns]]:
-    """Return the signatures of the candidates beside what ``fit`` has already."""
+def signatures_beside(
+    workspace: Comparison, listed: Iterable[Candidate], fit: Fit
+) -> Iterator[tuple[Candidate, Columns]]:
+    """Yield the signatures of the candidates beside what ``fit`` has already."""
     beside = [*workspace.base, *fit.coefficients_with_nuisance]
     now = workspace.simulate(beside)
-    return [(c, signature_columns(c, workspace, now, beside)) for c in listed]
+    for c in listed:
+        yield c, signature_columns(c, workspace, now, beside)
 
 
 class SignatureBank:
@@ -227,15 +230,23 @@ def solve_observable(fisher: FloatArray, score: FloatArray, original: FloatArray
 
 
 class Screen:
-    """All candidates' signatures, whitened, side by side."""
+    """All candidates' signatures, whitened, side by side.
 
-    def __init__(self, workspace: Comparison, signatures: Sequence[tuple[Candidate, Columns]]) -> None:
+    ``most``: bound of their columns, if the signatures are to be taken one by one: those of minutes are hundreds of
+    megabytes.
+    """
+
+    def __init__(
+        self, workspace: Comparison, signatures: Iterable[tuple[Candidate, Columns]], most: int | None = None
+    ) -> None:
         self.candidates: list[Candidate] = []
         self.slices: list[slice] = []
-        # One array from the start: a recording of minutes has hundreds of megabytes of signatures.
-        rows = np.empty((sum(len(c) for _, c in signatures), sum(m.size for m in workspace.measured)), dtype=np.float32)
+        listed = list(signatures) if most is None else signatures
+        count = sum(len(c) for _, c in listed) if most is None else most
+        # One array from the start.
+        rows = np.empty((count, sum(m.size for m in workspace.measured)), dtype=np.float32)
         at = 0
-        for candidate, columns in signatures:
+        for candidate, columns in listed:
             white = rows[at : at + len(columns)]
             for row, column in zip(white, columns, strict=True):
                 row[:] = workspace.whiten([table.astype(np.float64) for table in column])

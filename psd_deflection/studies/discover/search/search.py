@@ -151,9 +151,10 @@ class Search(Trials):
         """The search after it ran, and what it found: perhaps that nothing is missing. ``null``: the fit of no effect;
         ``begun``: that of the effects to begin with.
 
-        This one stays as it is.
+        This one stays as it is, but for the signatures, which it would have to make again.
         """
         out = copy.copy(self)
+        self._screen = None
         out.trace, out.dropped = [], {}
         out.count_anew()
         return out, out.searched(null, begun)
@@ -250,7 +251,7 @@ class Search(Trials):
     def _screen_anew(self, current: Fit) -> None:
         """With the signatures beside ``current``."""
         self._beside = tuple(a.label for a in current.effects)
-        self.screen = self.screen_beside(current)
+        self.screen_anew(current)
 
     def _looks_closer(self, current: Fit) -> bool:
         """Whether the signatures are new: those beside ``current``, if it leaves something that no other explains."""

@@ -191,12 +191,20 @@ class Trials:
         self._make_screen = screen
         self._progress = progress
         begun = workspace.simulations
-        self.screen = screen(workspace, None)
+        self._screen: Screen | None = screen(workspace, None)
+        self._screened: Fit | None = None
         self._signatures = workspace.simulations - begun
         self._begun = begun
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
         self.dropped: dict[int, tuple[Fit, list[Fit]]] = {}
+
+    @property
+    def screen(self) -> Screen:
+        """All signatures side by side; made again if another search took them over."""
+        if self._screen is None:
+            self._screen = self._make_screen(self.workspace, self._screened)
+        return self._screen
 
     @property
     def spent(self) -> int:
@@ -235,6 +243,12 @@ class Trials:
     def screen_beside(self, fit: Fit) -> Screen:
         """Return the signatures beside ``fit``."""
         return self._make_screen(self.workspace, fit)
+
+    def screen_anew(self, fit: Fit) -> None:
+        """Take the signatures beside ``fit`` from now on."""
+        # Two screens at once would be too much of a long recording.
+        self._screen, self._screened = None, fit
+        self._screen = self.screen_beside(fit)
 
     def best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int, iterations: int) -> Fit | None:
         """Refit each start a little, the best few in full."""
@@ -314,7 +328,7 @@ class Trials:
         if self.workspace.open_level:
             self.penalty = float(np.log(self.workspace.effective_size()))
         fit = refit(self.workspace, fit.effects, iterations=6)
-        self.screen = self.screen_beside(fit)
+        self.screen_anew(fit)
         return fit
 
     def refit(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
