@@ -400,8 +400,7 @@ def test_a_drift_is_rejected_if_it_moves_a_dot(nominal: Rig) -> None:
 
 def test_without_light_x_and_y_mean_nothing_and_are_not_judged(nominal: Rig) -> None:
     """A quotient of nothing may be at the rail. A sum of 0 or below is no light."""
-    volts = white((9.99, 0.0, -3e-3, 0.0, -9.99, 1e-6), sigma=1e-4)
-    levels = dark_levels([run_of(volts)], nominal)
+    levels = dark_levels([run_of(white((9.99, 0.0, -3e-3, 0.0, -9.99, 1e-6), sigma=1e-4))], nominal)
     assert levels[0].share == 0.0
     assert 'no other light' in words_of_level(levels[0])
     rig = replace_values(nominal, values_of_levels(levels[:1]))

@@ -69,8 +69,7 @@ def test_constant_channel_is_stuck_if_noise_moves_bits() -> None:
     assert levels(RIG, volts).stuck == ('y1', 'sum2')
     # Noise of one step of the converter moves none for sure.
     for noise, stuck in ((STEP, ()), (1.01 * STEP, ('y1', 'sum2'))):
-        quiet = load_rig(overrides={'amplifier.noise': noise})
-        assert levels(quiet, volts).stuck == stuck
+        assert levels(load_rig(overrides={'amplifier.noise': noise}), volts).stuck == stuck
 
 
 def test_one_sample_has_no_noise() -> None:

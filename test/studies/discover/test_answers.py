@@ -186,8 +186,7 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
         late = compared(Recorded((dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0)),), RIG, ()))[1]
         assert np.isnan(late.observations[0].volts[:, 0]).sum() == excluded
     # The link follows its loads as simulated: nothing is late.
-    assert likely_delays(Workspace([o])) == []
-    assert likely_delays(Workspace([make_observation()])) == []
+    assert (likely_delays(Workspace([o])), likely_delays(Workspace([make_observation()]))) == ([], [])
     part = 0.01 * np.random.default_rng(0).standard_normal((6, 300))
     part[4, 120:] += 2.0
     part[3, 120:] -= 1.0
@@ -264,8 +263,7 @@ class Linear:
 def test_a_signature_is_the_change_by_one_probe() -> None:
     size = EffectParameter('a', 'V', -1.0, 1.0, 0.1, '', nominal=0.3)
     phase = EffectParameter('p', 'rad', -7.0, 7.0, 1.0, '', kind='phase', partner='a')
-    place = EffectParameter('q', 'm', -1.0, 1.0, 0.25, '', kind='coupled')
-    (c,) = listed(declared(size, phase, place))
+    (c,) = listed(declared(size, phase, EffectParameter('q', 'm', -1.0, 1.0, 0.25, '', kind='coupled')))
     plant = Linear(lambda v: 100.0 * v['a'] + 1000.0 * v['p'] + v['a'] * (7.0 * v['q'] + 3.0))
     base = [ActiveEffect(c.effect, {'a': 1.0, 'p': 0.0, 'q': 0.0})]
     nominal = [np.full((6, 2), 103.0 + 30.9)]
@@ -279,8 +277,7 @@ def test_a_signature_is_the_change_by_one_probe() -> None:
     (c,) = listed(declared(dataclasses.replace(size, nominal=1.0)))
     ((column,),) = signature_columns(c, cast(Workspace, Linear(lambda v: v['a'] ** 2)), [np.full((6, 2), 1.0)], [])
     assert column[0, 0] == pytest.approx(1.0 - 0.9**2)
-    probed = EffectParameter('limit', 'V', 0.0, 1.0, 0.1, '', grid=(0.2,))
-    (c,) = listed(declared(probed, finite=True))
+    (c,) = listed(declared(EffectParameter('limit', 'V', 0.0, 1.0, 0.1, '', grid=(0.2,)), finite=True))
     ((column,),) = signature_columns(
         c, cast(Workspace, Linear(lambda v: 5.0 * v['limit'])), [np.full((6, 2), 0.25)], []
     )
@@ -507,8 +504,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(study: Discovery) -> No
     def gaps(*effects: ActiveEffect) -> FloatArray:
         off = o.volts - ForwardModel(RIG, list(effects)).expect(o.loads, o.temperature).volts.T
         dots = off[:, [0, 1, 3, 4]] * RIG.sensitivities.ravel()
-        blocks = dots.reshape(60, 20, 4).mean(axis=1)
-        return np.asarray(np.sqrt(np.mean(blocks**2, axis=0)))
+        return np.asarray(np.sqrt(np.mean(dots.reshape(60, 20, 4).mean(axis=1) ** 2, axis=0)))
 
     before, after = gaps(), gaps(named.active)
     assert study.gap_before == study.gap_heldout_before == pytest.approx(float(np.sqrt(np.mean(before**2))), rel=1e-6)
@@ -536,8 +532,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(study: Discovery) -> No
         ForwardModel(RIG, [plus]).expect(o.loads, o.temperature).volts
         - ForwardModel(RIG, [named.active]).expect(o.loads, o.temperature).volts
     ) / h
-    sigma = study.workspace.noise[0].sigma
-    information = float(((slope / sigma[:, None]) ** 2).sum())
+    information = float(((slope / study.workspace.noise[0].sigma[:, None]) ** 2).sum())
     assert named.sd['angle'] == pytest.approx(information**-0.5, rel=0.01)
     gain = study.search.null.chi2 - study.fit.chi2
     assert named.delta_bic == pytest.approx(gain - math.log(6 * 1200 / 20), rel=1e-9)

@@ -616,8 +616,7 @@ def test_a_size_that_hardly_any_load_shows_stays_off(sideways: float) -> None:
     true = replace_values(RIG, {'effects.e.name': 'load_offset', 'effects.e.x': 0.005})
     volts = RigSimulator(true, 3).step(history).counts * RIG.converter.volts_per_count
     workspace = Workspace([Observation('x', RIG, np.asarray(volts, dtype=np.float64), history)], ())
-    effect = catalogue()['load_offset']
-    fitted = refit(workspace, [ActiveEffect(effect, {'x': 0.001, 'y': -1.0})])
+    fitted = refit(workspace, [ActiveEffect(catalogue()['load_offset'], {'x': 0.001, 'y': -1.0})])
     (offset,) = fitted.effects
     assert offset.values['x'] == pytest.approx(0.005, abs=1e-4)
     assert offset.values['y'] == 0.0

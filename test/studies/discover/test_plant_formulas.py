@@ -171,8 +171,7 @@ def test_few_values_make_the_interval_of_student() -> None:
     wanted = math.sqrt(sum(variances)) * student.ppf(0.975, nu) / norm.ppf(0.975)
     assert sd_of_size(values, both) == pytest.approx(wanted, rel=1e-3)
     # As many sizes as values leave one degree of freedom, not none.
-    ws = PlantComparison(Pictures(values, {}))
-    each = ws.sd(np.eye(2 * len(x)), np.eye(2 * len(x)))
+    each = PlantComparison(Pictures(values, {})).sd(np.eye(2 * len(x)), np.eye(2 * len(x)))
     assert each == pytest.approx(math.sqrt(len(x)) * student.ppf(0.975, 1) / norm.ppf(0.975), rel=1e-3)
     # A stated noise is not told by the values: it is the normal law's.
     assert sd_of_size(values, picture, noise=(9.0, 9.0)) == pytest.approx(9.0 / math.sqrt(float(x @ x)), rel=1e-3)
@@ -399,14 +398,12 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     plant = Pictures(observed, {}, period=period)
     plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
     ws = PlantComparison(plant)
-    fit = refit(ws, ())
-    located = plant_search.localise_cases(ws, fit, None)
+    located = plant_search.localise_cases(ws, refit(ws, ()), None)
     cells = {(c.channel, c.recording): c for c in located.cells}
     assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
     for (channel, case), cell in cells.items():
         c = ws.channels.index(channel)
-        there = int(np.isfinite(observed[case][c]).sum())
-        dof = float(ws.independent[c]) * there / float(ws.total[c])
+        dof = float(ws.independent[c]) * int(np.isfinite(observed[case][c]).sum()) / float(ws.total[c])
         energy = float(np.nansum((observed[case][c] / ws.scale[c]) ** 2))
         assert cell.energy == pytest.approx(energy - dof)
         p = float(chi2_law.sf(energy, dof))

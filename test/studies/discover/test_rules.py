@@ -530,8 +530,7 @@ def test_the_error_of_an_unseen_gain_is_the_smaller_of_two() -> None:
     spike[:, 0] = 1.0
     plant = Plant({A: spike}, without_noise((spike, 400.0)))
     null, fit = refit(plant, ()), refit(plant, [active('a', x=0.0)])
-    fit = dataclasses.replace(fit, jacobian=np.zeros_like(fit.jacobian))
-    gain = heldout_gain(plant, null, fit)
+    gain = heldout_gain(plant, null, dataclasses.replace(fit, jacobian=np.zeros_like(fit.jacobian)))
     assert gain.error == pytest.approx(math.sqrt(2.0 * 200.0), rel=1e-3)
     assert gain.significant
     assert not HeldOut(2.0, 1.0).significant
@@ -630,8 +629,7 @@ def test_sizes_come_from_coefficients_of_pictures() -> None:
 def test_two_sizes_are_tied_if_their_ratio_is_one_within_the_fit(ratio: float, tied: bool) -> None:
     shown = pictures(A, B)
     shown[B] -= shown[A] * np.sum(shown[A] * shown[B]) / np.sum(shown[A] ** 2)
-    sd = 0.01
-    size = 50 * SIGMA / np.linalg.norm(shown[A]) / (sd / 0.02)
+    size = 50 * SIGMA / np.linalg.norm(shown[A]) / (0.01 / 0.02)
     plant = Plant(shown, size * shown[A] + ratio * size * shown[B])
     fit = refit(plant, [active('a', x=0.0), active('b', x=0.0)])
     got = coincidences(fit, plant.physics)

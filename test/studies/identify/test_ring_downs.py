@@ -98,8 +98,7 @@ def test_one_mode_is_split_into_two(apart: float) -> None:
 
 def test_at_most_thirty_windows_are_tried() -> None:
     """Half a window apart; a quiet one is not, nor one of which a fifth is lost."""
-    t = times(9000)
-    samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * t)
+    samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * times(9000))
     firsts = sorted(s.first for s in fitting.seed_windows(samples, samples, SAMPLE_RATE, [(16.0, 0.01)], 1e-6, 100, 25))
     assert len(firsts) == 30
     assert np.diff(firsts).min() >= 50
@@ -194,8 +193,7 @@ def test_mode_stays_if_it_saves_30_plus_4_per_stretch(monkeypatch: pytest.Monkey
     rng = np.random.default_rng(9)
     both = [stretch(ring(t, size=s) + ring(t, 50.0, 0.01, 5e-6) + 1e-6 * rng.normal(size=800)) for s in (1e-3, -7e-4)]
     two = fitting.fit_modes(both, [(50.0, 0.01), (16.0, 0.02)])
-    single = fitting.fit_modes(both, [(16.0, 0.02)])
-    saved = float(np.sum(single.residual**2) - np.sum(two.residual**2))
+    saved = float(np.sum(fitting.fit_modes(both, [(16.0, 0.02)]).residual ** 2) - np.sum(two.residual**2))
     for factor, count in ((37.9, 1), (38.1, 2)):
         asked: list[float] = []
 
