@@ -147,8 +147,21 @@ def mistakes(
     ]
     if delays:
         delay = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'delay of the recorded load times', grid=tuple(delays))
-        late = Effect('load_delay', 'load', 'late loads', '', '', '', (delay,), 'load', apply=_delay, order=-1)
-        out.append(dataclasses.replace(late, finite=True, full=True))
+        late_loads = Effect(
+            'load_delay',
+            'load',
+            'late loads',
+            '',
+            '',
+            '',
+            (delay,),
+            'load',
+            apply=_delay,
+            order=-1,
+            finite=True,
+            full=True,
+        )
+        out.append(late_loads)
     if recordings > 1:
         places = [_amplitude(n, 'm', -0.02, 0.02, 1e-5, 'unloaded dot') for n in dot_names(psds)]
         of_reading = EffectParameter('of_reading', '', 0, 1, 1, '0: beam, 1: reading', kind='choice', choices=(0, 1))

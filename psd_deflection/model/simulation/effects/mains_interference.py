@@ -35,7 +35,14 @@ EFFECT = Effect(
     needs='nothing',
     parameters=(
         EffectParameter(
-            *('frequency', 'Hz', 0.5, 499.0, 2e-3, 'its frequency', 50.0, 'shape'),
+            'frequency',
+            'Hz',
+            0.5,
+            499.0,
+            2e-3,
+            'its frequency',
+            nominal=50.0,
+            kind='shape',
             grid=(50.0, 60.0),
             propose='line',
         ),
@@ -45,7 +52,12 @@ EFFECT = Effect(
         ),
         *(
             EffectParameter(
-                *(f'phase_{c}', 'rad', -2.0 * math.pi, 2.0 * math.pi, 0.1, f'its phase on {c}'),
+                f'phase_{c}',
+                'rad',
+                -2.0 * math.pi,
+                2.0 * math.pi,
+                0.1,
+                f'its phase on {c}',
                 kind='phase',
                 partner=f'amplitude_{c}',
                 of_psd=_of_psd(c),

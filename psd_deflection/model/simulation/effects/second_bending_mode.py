@@ -47,7 +47,14 @@ EFFECT = Effect(
     parameters=(
         EffectParameter('gain', '', -1.0, 1.0, 1e-3, 'its share of the static deflection'),
         EffectParameter(
-            *('frequency', 'Hz', 5.0, 450.0, 0.2, 'its frequency', 87.7, 'shape'),
+            'frequency',
+            'Hz',
+            5.0,
+            450.0,
+            0.2,
+            'its frequency',
+            nominal=87.7,
+            kind='shape',
             grid=(87.7,),
             propose='spectral',
             within=_above_the_first,
@@ -56,7 +63,12 @@ EFFECT = Effect(
             'damping_ratio', '', 1e-4, 0.5, 2e-3, 'its damping ratio', nominal=0.02, kind='shape', grid=(0.01,)
         ),
         EffectParameter(
-            *('shares', '', 0, 2, 1, '0: adds its own static part, 1: takes it from the first mode, 2: rings only'),
+            'shares',
+            '',
+            0,
+            2,
+            1,
+            '0: adds its own static part, 1: takes it from the first mode, 2: rings only',
             kind='choice',
             choices=(0, 1, 2),
         ),

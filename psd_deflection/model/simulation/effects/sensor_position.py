@@ -27,7 +27,11 @@ EFFECT = Effect(
         EffectParameter('x', 'm', -0.5, 0.5, 1e-4, 'centre, from where the rig file has it'),
         EffectParameter('y', 'm', -0.5, 0.5, 1e-4, 'centre, from where the rig file has it'),
         EffectParameter(
-            *('aimed', '', 0, 1, 1),
+            'aimed',
+            '',
+            0,
+            1,
+            1,
             '1: the laser was aimed at the true centre; 0: it stands where the rig file says',
             nominal=1,
             kind='choice',
