@@ -105,8 +105,7 @@ def test_csv_out_has_the_contracts_columns(tmp_path: Path) -> None:
     with out.open() as stream:
         rows = list(csv.DictReader(stream))
     names = ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta']
-    assert list(rows[0])[:7] == names
-    assert list(rows[0])[-4:] == ['chi_square', 'fx', 'fy', 'tz']
+    assert (list(rows[0])[:7], list(rows[0])[-4:]) == (names, ['chi_square', 'fx', 'fy', 'tz'])
     # The load at the tip, N.
     assert max(abs(float(r['fy'])) for r in rows) > 10.0
     # One number left of four readings and three unknowns: half of a chi-square is below 0.455, and means of a ringing

@@ -67,8 +67,9 @@ class RecordedRig(Machine):
             recorded = step(recorded)
         progress('simulating the rig as it is described')
         recorded, workspace = recordings_ready.compared(recorded)
-        # Signatures that are kept are those of recordings as they were, from rest.
-        changed = recorded.mistaken or bool(workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
+        # Signatures that are kept are those of recordings as they were, from rest, without a gap.
+        gaps = not all(np.isfinite(o.volts).all() for o in workspace.observations)
+        changed = recorded.mistaken or gaps or bool(workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
         bank_of_rig = SignatureBank() if bank is None or changed else bank
         bank_of_rig.nominal(workspace)
         proposals = proposals_of(workspace)

@@ -28,7 +28,7 @@ from psd_deflection.studies.discover.recorded_rig import RecordedRig, rig_of
 from psd_deflection.studies.discover.redundant import FourthReading, excess, visible
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.screen import Candidate, Screen
+from psd_deflection.studies.discover.search.screen import Candidate, Screen, SignatureBank
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.weighing import Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
@@ -192,6 +192,14 @@ def test_the_times_that_nobody_noted_are_free(began: bool, ended: bool) -> None:
     assert [np.sign(d.change.toarray()).tolist() for d in free[:3]] == applied.tolist()
     wanted = [at for at, there in ((1000, began), (2500, ended)) if there]
     assert [int(np.abs(d.change.toarray()).sum(axis=1).argmax()) for d in free[3:]] == pytest.approx(wanted, abs=2)
+
+
+def test_signatures_with_a_gap_are_not_kept() -> None:
+    bank = SignatureBank()
+    for lost in (0, 30):
+        o = make_observation(warm=None)
+        o.volts[1000 : 1000 + lost] = np.nan
+        assert (RecordedRig.of([o], RIG, (), bank, lambda _: None).bank is bank) is (lost == 0)
 
 
 @pytest.mark.parametrize(('share', 'there'), [(1.1, True), (0.9, False)])
