@@ -213,7 +213,7 @@ def test_samples_as_tables_with_units(tmp_path: Path) -> None:
     assert list(frame['x1']) == [0, 1, 2, 3, 4, 5]
     # Before the first load it is not known; after it, it is held. A reference holds at its row only.
     assert np.isnan(frame['load_fy'].iloc[:2]).all()
-    assert (list(frame['load_fy'].iloc[2:]), list(np.flatnonzero(frame['ref_dy'].notna()))) == ([-2.0] * 4, [3])
+    assert (list(frame['load_fy'].iloc[2:]), np.flatnonzero(frame['ref_dy'].notna()).tolist()) == ([-2.0] * 4, [3])
     assert 'temperature' not in frame
     units = frame.attrs['units']
     assert (units['t'], units['x1'], units['load_tz'], units['ref_theta']) == ('s', 'V', 'N m', 'rad')
