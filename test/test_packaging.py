@@ -22,7 +22,7 @@ from tools.release import TREE
 ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
 """Folders of test/ that are no room of the package: what they test, or use, lies beside it."""
-TESTED_ELSEWHERE = {'records'}
+TESTED_ELSEWHERE = {'plants', 'records'}
 """A room without tests of its own: it declares only."""
 EXECUTABLES = (
     *('estimator', 'replay', 'simulate', 'discover', 'calibrate', 'camera'),
