@@ -136,7 +136,7 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     else:
         fall = landings if physics.psds_at_base else points_under
         qx, qy = fall(places, moved, physics.xp)
-    dots = np.empty_like(beams)
+    dots = np.empty(beams.shape)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])
     return dots

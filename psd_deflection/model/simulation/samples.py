@@ -56,3 +56,10 @@ class SimulatedSamples:
             if isinstance(rows := getattr(self, name), np.ndarray):
                 setattr(out, name, rows[..., :n])
         return out
+
+    def up_to_plate(self, physics: Physics) -> Self:
+        """The samples up to the dots on the plate, shared and read-only, for another reading of them."""
+        out = replace(self, physics=physics, dots=_none(), sums=_none(), volts=_none(), between=no_samples_between)
+        for rows in (self.t, self.warmer, self.loads, self.static, self.pose, self.beams, self.true_dots):
+            rows.setflags(write=False)
+        return out

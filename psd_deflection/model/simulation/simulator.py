@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
-from psd_deflection.model.simulation.declaration import ActiveEffect, State
+from psd_deflection.model.simulation.declaration import ActiveEffect, Point, State
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.physics import Physics, dots_on_plate
 from psd_deflection.model.simulation.samples import SimulatedSamples, no_samples_between
@@ -21,8 +21,12 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
 
-PIECE = 8192
-"""Samples of a piece of :meth:`ForwardModel.expect_in_pieces`: an array of them is 64 KB."""
+BEFORE_PLATE: tuple[Point, ...] = ('configure', 'load', 'static', 'pose', 'beam')
+"""Where an effect acts before the dots fall on the plate."""
+
+PIECE = 5120
+"""Samples of a piece of :meth:`ForwardModel.expect_in_pieces`: an array of three rows of them is less than 128 KB,
+from which an allocator maps pages anew for every array."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +75,24 @@ class ForwardModel:
         self._count = 0
         self._first_temperature: float | None = None
 
-    def run(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedSamples:
+    @property
+    def in_pieces(self) -> bool:
+        """Whether a long history may be simulated piece after piece: no sample depends on later ones."""
+        return not self.ahead and not any(active.effect.full for active in self.effects)
+
+    @property
+    def moving(self) -> list[ActiveEffect]:
+        """The effects that decide where the dots fall on the plate: those of constants, loads, link and beams."""
+        return [a for a in self.effects if a.effect.configure is not None or a.effect.point in BEFORE_PLATE]
+
+    def run(
+        self, loads: FloatArray, temperature: FloatArray | None = None, moved: SimulatedSamples | None = None
+    ) -> SimulatedSamples:
         """The next n samples, up to the amplifier's volts: ``loads`` (n, 3) N, N, N m.
 
-        ``temperature`` (n,), degrees Celsius; None is a steady one. Raises ConfigError for a second call if an effect
-        looks ahead.
+        ``temperature`` (n,), degrees Celsius; None is a steady one. ``moved``: these samples up to the dots on the
+        plate, by a model of the same ``moving`` effects, which are then not simulated again. Raises ConfigError for a
+        second call if an effect looks ahead.
         """
         if self.ahead and len(loads):
             if self._count:
@@ -86,10 +103,12 @@ class ForwardModel:
             loads = np.concatenate((loads, np.repeat(loads[-1:], self.ahead, axis=0)))
             if temperature is not None:
                 temperature = np.concatenate((temperature, np.repeat(temperature[-1:], self.ahead)))
-            return self._run(loads, temperature).first(n)
-        return self._run(loads, temperature)
+            return self._read(self._moved(loads, temperature), loads, temperature).first(n)
+        samples = self._moved(loads, temperature) if moved is None else moved.up_to_plate(self.physics)
+        return self._read(samples, loads, temperature)
 
-    def _run(self, loads: FloatArray, temperature: FloatArray | None) -> SimulatedSamples:
+    def _moved(self, loads: FloatArray, temperature: FloatArray | None) -> SimulatedSamples:
+        """Samples up to the dots on the plate."""
         n = len(loads)
         p = self.physics
         warmer = np.zeros(n)
@@ -101,7 +120,6 @@ class ForwardModel:
         if p.phase > 0.0:
             t += p.phase
         self._count += n
-        self._asked = {}
         samples = SimulatedSamples(t, warmer, np.array(np.asarray(loads, dtype=np.float64).T, order='C'), p)
         self._at('load', samples)
         samples.static = np.empty((3, n))
@@ -114,9 +132,18 @@ class ForwardModel:
             held = samples.static[axis] + self._at_rest[axis] if axis < 2 else samples.static[axis]
             samples.pose[axis] = held if self._steady else mode(held)
         self._at('pose', samples)
-        samples.beams = np.repeat(p.beams.reshape(-1, 1), n, axis=1)
-        self._at('beam', samples)
+        samples.beams = np.broadcast_to(p.beams.reshape(-1, 1), (p.beams.size, n))
+        if any(active.effect.point == 'beam' for active in self.effects):
+            samples.beams = samples.beams.copy()
+            self._at('beam', samples)
         samples.true_dots = dots_on_plate(samples.pose, samples.beams, p)
+        return samples
+
+    def _read(self, samples: SimulatedSamples, loads: FloatArray, temperature: FloatArray | None) -> SimulatedSamples:
+        """From the dots on the plate to the volts."""
+        n = len(loads)
+        self._asked = {}
+        p = self.physics
         samples.dots = samples.true_dots.copy()
         psds = len(p.centers)
         samples.sums = np.full((psds, n), p.sum_nominal)
@@ -124,7 +151,8 @@ class ForwardModel:
         samples.volts = np.empty((3 * psds, n))
         samples.noise = np.zeros(3 * psds)
         for psd in range(psds):
-            samples.volts[3 * psd : 3 * psd + 2] = samples.dots[2 * psd : 2 * psd + 2] / p.sensitivity[psd, :, None]
+            dots = samples.dots[2 * psd : 2 * psd + 2]
+            np.divide(dots, p.sensitivity[psd, :, None], out=samples.volts[3 * psd : 3 * psd + 2])
             samples.volts[3 * psd + 2] = samples.sums[psd]
             if p.dark[psd, 2] > 0.0:
                 _add_light(samples.volts[3 * psd : 3 * psd + 3], p.dark[psd])
@@ -153,12 +181,14 @@ class ForwardModel:
         """Apply the effects that act on the noisy signal: clipping and coarse steps."""
         self._at('output', samples)
 
-    def expect(self, loads: FloatArray, temperature: FloatArray | None = None) -> SimulatedSamples:
+    def expect(
+        self, loads: FloatArray, temperature: FloatArray | None = None, moved: SimulatedSamples | None = None
+    ) -> SimulatedSamples:
         """Like :meth:`run`, then the mean of the output over the rig's noise.
 
         Values beyond the converter's range are limited to its ends, as in a recording.
         """
-        samples = self.run(loads, temperature)
+        samples = self.run(loads, temperature, moved)
         samples.noise = self.physics.noise
         self.finish(samples)
         full = self.physics.full_scale
@@ -166,18 +196,23 @@ class ForwardModel:
         return samples
 
     def expect_in_pieces(
-        self, loads: FloatArray, temperature: FloatArray | None = None, unit: int = 1
-    ) -> Iterator[tuple[slice, FloatArray]]:
-        """(which samples, their volts (3P, m)) of a long history, piece after piece, each as by :meth:`expect`.
+        self,
+        loads: FloatArray,
+        temperature: FloatArray | None = None,
+        unit: int = 1,
+        moved: Sequence[SimulatedSamples] = (),
+    ) -> Iterator[tuple[slice, SimulatedSamples]]:
+        """(which samples, these m samples) of a long history, piece after piece, each as by :meth:`expect`.
 
         A piece is a multiple of ``unit`` samples, but for the last, and so short that what is computed for it stays
-        in the processor's cache.
+        in the processor's cache. ``moved``: the pieces as by :meth:`run`.
         """
         n = len(loads)
-        size = n if self.ahead or any(active.effect.full for active in self.effects) else max(1, PIECE // unit) * unit
-        for first in range(0, n, max(1, size)):
+        size = max(1, PIECE // unit) * unit if self.in_pieces else n
+        for number, first in enumerate(range(0, n, max(1, size))):
             at = slice(first, min(first + size, n))
-            yield at, self.expect(loads[at], None if temperature is None else temperature[at]).volts
+            warm = None if temperature is None else temperature[at]
+            yield at, self.expect(loads[at], warm, moved[number] if moved else None)
 
     def _at(self, point: str, samples: SimulatedSamples) -> None:
         for i, active in enumerate(self.effects):

@@ -223,7 +223,7 @@ def test_a_long_history_is_simulated_in_pieces(monkeypatch: pytest.MonkeyPatch) 
         assert [at.stop - at.start for at, _ in pieces] == sizes
         assert [at.start for at, _ in pieces] == [sum(sizes[:i]) for i in range(len(sizes))]
         full = ForwardModel(load_rig(), effects).expect(steps, warm).volts
-        assert np.array_equal(np.concatenate([volts for _, volts in pieces], axis=1), full)
+        assert np.array_equal(np.concatenate([samples.volts for _, samples in pieces], axis=1), full)
     assert list(ForwardModel(load_rig(), [at_once]).expect_in_pieces(steps[:0], None)) == []
 
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from psd_deflection import __version__
+from psd_deflection.model.simulation import simulator
 from psd_deflection.model.simulation.catalogue import catalogue, make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Proposal
 from psd_deflection.model.simulation.laws import Law, LawTerm
-from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.physics import Physics, dots_on_plate
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
@@ -130,6 +131,46 @@ def test_a_recording_that_begins_in_motion_rings_out() -> None:
                 a, b = values[names[2 * axis]], values[names[2 * axis + 1]]
                 added = ((a - 1j * b) * np.exp(root * t)).real if t >= 0.0 else 0.0
                 assert samples.pose[axis, i] - pose[axis, i] == pytest.approx(added, abs=1e-12)
+
+
+@pytest.mark.repeatable
+def test_a_motion_that_is_asked_for_again_is_kept_and_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Effects of a PSD leave where the dots fall; any other, other loads and a look ahead simulate it anew."""
+    fallen = list[int]()
+
+    def counted(pose: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
+        fallen.append(1)
+        return dots_on_plate(pose, beams, physics)
+
+    monkeypatch.setattr(simulator, 'PIECE', 700)
+    monkeypatch.setattr(simulator, 'dots_on_plate', counted)
+    observations = [make_observation(), make_observation(1, name='second', warm=None)]
+    observations[1].volts[100:200, :3] = np.nan
+    workspace = Workspace(observations)
+    pieces = sum(-(-len(o.loads) // 700) for o in observations)
+
+    def added(beside: Workspace, *effects: ActiveEffect) -> float:
+        """How often the dots' places were simulated, in pieces; the means are those of a new workspace."""
+        fallen.clear()
+        got = beside.simulate(effects)
+        count = len(fallen)
+        assert all(map(np.array_equal, got, Workspace(beside.observations).simulate(effects)))
+        return count / pieces
+
+    creep = make_active('creep', {'amplitude': 0.1}, 'test')
+    lag = make_active('amplifier_lag', {'time_constant': 1e-3}, 'test')
+    turned = [make_active('sensor_rotation', {'psd': 2, 'angle': angle}, 'test') for angle in (0.01, 0.02)]
+    first = ActiveEffect(of_setup('zero'), {**{p.name: p.nominal for p in of_setup('zero').parameters}, 'x1': 1e-3})
+    assert [added(workspace, *given) for given in ((), (), (turned[0],), (turned[1],))] == [1.0, 1.0, 0.0, 0.0]
+    assert added(workspace, lag) == 2.0  # At two phases between the samples, and not at them.
+    assert [added(workspace, *given) for given in ((creep,), (turned[0],))] == [1.0, 0.0]
+    assert [added(workspace, creep, *given) for given in ((turned[0],), (turned[1],), ())] == [1.0, 0.0, 0.0]
+    # The zero is of the first recording.
+    assert [added(workspace, *given) for given in ((), (first,), (first,), (turned[0],))] == [1.0, 1.0, 0.5, 0.5]
+    early = make_active('channel_skew', {'psd': 1, 'delay': -3e-3}, 'test')
+    assert [added(workspace, *given) > 0.0 for given in ((), (early,), ())] == [True, True, False]
+    heavier = workspace.loaded(0, 2.0 * observations[0].loads)
+    assert [added(heavier), added(workspace)] == [0.5, 0.0]
 
 
 def test_an_effect_of_one_recording_acts_in_that_alone() -> None:

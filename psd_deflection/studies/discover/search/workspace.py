@@ -4,8 +4,8 @@
 its negative log-likelihood. All simulations are run and counted here."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Self
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from psd_deflection.base.charts import ONE_AFTER_ANOTHER, TimeAxis
 from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.observation import Observation, load_cases
 from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
@@ -33,7 +34,46 @@ from psd_deflection.studies.discover.thresholds import FOLDS, MAX_FINE
 from psd_deflection.studies.loads.plate_motion import dot_rows, fine_means
 from psd_deflection.studies.loads.thresholds import FINE_SECONDS, MINOR, REST_S, SLIGHT
 
+
+class _Asked(NamedTuple):
+    """``observation`` is compared by identity."""
+
+    observation: Observation
+    effects: list[ActiveEffect]
+
+
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
+
+
+class Motion:
+    """Where the dots of a recording fall on the plate, kept once it is asked for twice in a row: the effects of a PSD
+    leave it as it is, and most of a simulation's time is spent on it."""
+
+    def __init__(self) -> None:
+        self._asked: _Asked | None = None
+        self._kept: _Asked | None = None
+        self._pieces: list[SimulatedSamples] = []
+
+    def simulated(
+        self, observation: Observation, model: ForwardModel, unit: int
+    ) -> Iterator[tuple[slice, SimulatedSamples]]:
+        """The pieces of ``observation`` by a new ``model``, as of :meth:`ForwardModel.expect_in_pieces`."""
+        asked = _Asked(observation, model.moving)
+        inputs = observation.acting, observation.temperature, unit
+        if asked == self._kept and model.in_pieces:
+            yield from model.expect_in_pieces(*inputs, self._pieces)
+            return
+        keeps = asked == self._asked and model.in_pieces
+        self._asked = asked
+        if keeps:
+            self._kept, self._pieces = None, []
+        pieces = list[SimulatedSamples]()
+        for at, samples in model.expect_in_pieces(*inputs):
+            if keeps:
+                pieces.append(samples.up_to_plate(samples.physics))
+            yield at, samples
+        if keeps:
+            self._kept, self._pieces = asked, pieces
 
 
 class Workspace(Comparison):
@@ -50,6 +90,7 @@ class Workspace(Comparison):
         self.physics = Physics.of(observations[0].rig)
         self.tally = SimulationCount()
         self.base = tuple(base)
+        self._motions = [Motion() for _ in observations]
         self.fine: list[int] = []
         self.measured: list[FloatArray] = []
         self.count: list[FloatArray] = []
@@ -144,9 +185,9 @@ class Workspace(Comparison):
         for i, (o, size, present) in enumerate(zip(self.observations, self.fine, self._present, strict=True)):
             model = ForwardModel(o.rig, only_in(sort_effects(effects), i))
             means = np.empty((3 * o.psds, len(o.loads) // size))
-            for at, volts in model.expect_in_pieces(o.acting, o.temperature, size):
+            for at, samples in self._motions[i].simulated(o, model, size):
                 there = None if present is None else present[:, at]
-                means[:, at.start // size : at.stop // size] = fine_means(volts, size, there)
+                means[:, at.start // size : at.stop // size] = fine_means(samples.volts, size, there)
             out.append(means)
         return out
 
