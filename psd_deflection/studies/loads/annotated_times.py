@@ -132,10 +132,10 @@ class CorrectedNote:
         return abs(self.delay) > ALIKE_S or self.took > 0.0
 
     def moved(self, moments: Sequence[float], period: float) -> CorrectedNote:
-        """It acted so many moments later and, the second number, took so many longer. A moment is a quarter of a
-        sample, of which one comes every ``period``, s.
+        """It acted so many moments later and, the second number, took so many longer; what is not given was not fitted.
+        A moment is a quarter of a sample, of which one comes every ``period``, s.
         """
-        later, slower = (*moments, 0.0)[:2]
+        later, slower, *_ = (*moments, 0.0, 0.0)
         moment = 0.25 * period
         return replace(self, applied=self.applied + later * moment, took=max(self.took + slower * moment, 0.0))
 

@@ -138,12 +138,12 @@ def test_a_motion_that_is_asked_for_again_is_kept_and_gives_the_same_bits(monkey
     """Effects of a PSD leave where the dots fall; any other, other loads and a look ahead simulate it anew."""
     fallen = list[int]()
 
-    def counted(pose: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
+    def fall(pose: FloatArray, beams: FloatArray, physics: Physics) -> FloatArray:
         fallen.append(1)
         return dots_on_plate(pose, beams, physics)
 
     monkeypatch.setattr(simulator, 'PIECE', 700)
-    monkeypatch.setattr(simulator, 'dots_on_plate', counted)
+    monkeypatch.setattr(simulator, 'dots_on_plate', fall)
     observations = [make_observation(), make_observation(1, name='second', warm=None)]
     observations[1].volts[100:200, :3] = np.nan
     workspace = Workspace(observations)
@@ -159,14 +159,14 @@ def test_a_motion_that_is_asked_for_again_is_kept_and_gives_the_same_bits(monkey
 
     creep = make_active('creep', {'amplitude': 0.1}, 'test')
     lag = make_active('amplifier_lag', {'time_constant': 1e-3}, 'test')
-    turned = [make_active('sensor_rotation', {'psd': 2, 'angle': angle}, 'test') for angle in (0.01, 0.02)]
+    rotated = [make_active('sensor_rotation', {'psd': 2, 'angle': angle}, 'test') for angle in (0.01, 0.02)]
     first = ActiveEffect(of_setup('zero'), {**{p.name: p.nominal for p in of_setup('zero').parameters}, 'x1': 1e-3})
-    assert [added(workspace, *given) for given in ((), (), (turned[0],), (turned[1],))] == [1.0, 1.0, 0.0, 0.0]
+    assert [added(workspace, *given) for given in ((), (), (rotated[0],), (rotated[1],))] == [1.0, 1.0, 0.0, 0.0]
     assert added(workspace, lag) == 2.0  # At two phases between the samples, and not at them.
-    assert [added(workspace, *given) for given in ((creep,), (turned[0],))] == [1.0, 0.0]
-    assert [added(workspace, creep, *given) for given in ((turned[0],), (turned[1],), ())] == [1.0, 0.0, 0.0]
+    assert [added(workspace, *given) for given in ((creep,), (rotated[0],))] == [1.0, 0.0]
+    assert [added(workspace, creep, *given) for given in ((rotated[0],), (rotated[1],), ())] == [1.0, 0.0, 0.0]
     # The zero is of the first recording.
-    assert [added(workspace, *given) for given in ((), (first,), (first,), (turned[0],))] == [1.0, 1.0, 0.5, 0.5]
+    assert [added(workspace, *given) for given in ((), (first,), (first,), (rotated[0],))] == [1.0, 1.0, 0.5, 0.5]
     early = make_active('channel_skew', {'psd': 1, 'delay': -3e-3}, 'test')
     assert [added(workspace, *given) > 0.0 for given in ((), (early,), ())] == [True, True, False]
     heavier = workspace.loaded(0, 2.0 * observations[0].loads)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.linalg import null_space
+from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal, ttest_1samp
 
 import psd_deflection
@@ -407,3 +408,25 @@ def test_terms_are_least_squares_and_judged_unseen(size: float, remains: bool, o
         assert 0.01 < weak.weight < 0.9
         values = [v for a in got.effects for v in a.values.values()]
         assert values[:5] == pytest.approx(want[:5].tolist(), rel=0.05)
+
+
+def test_a_size_at_its_bound_leaves_the_others_to_fit_beside_it() -> None:
+    """A term that would be less than it may be, beside one alike: least squares within the bounds, not cut off."""
+    names = ('a', 'x'), ('b', 'x'), ('c', 'x')
+    shown = pictures(*names)
+    shown['c', 'x'] = 0.8 * shown['b', 'x'] + 0.6 * shown['c', 'x']
+    truth = (10.0 * SIGMA, 2.0 * SIGMA, -1.5 * SIGMA)
+    plant = Bounded(shown, sum((v * shown[n] for n, v in zip(names, truth, strict=True)), noise()))
+    rows = [
+        (candidate('b', 'x'), [[1e-3 * shown['b', 'x']]]),
+        (candidate('c', 'x', least=0.0), [[1e-3 * shown['c', 'x']]]),
+    ]
+    got = predictive.predictive_of(
+        plant, refit(plant, [active('a', x=0.5)]), Screen(plant, rows), np.random.default_rng(0)
+    )
+    assert got is not None
+    table, y = columns(shown, *names) * SIGMA, plant.measured[0].ravel()
+    want = lsq_linear(table, y, ([-np.inf, -np.inf, 0.0], np.inf)).x
+    (b,) = got.terms  # Not c.
+    assert [b.value / want[1], b.weight] == pytest.approx([1.0, 1.0], abs=0.05)
+    assert np.linalg.lstsq(table, y, rcond=None)[0][1] > 1.5 * want[1]

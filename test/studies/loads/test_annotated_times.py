@@ -213,6 +213,7 @@ def test_load_between_samples_moves_link_at_its_time(moments: float) -> None:
     loads[first:, 1] = -50.0
     note = annotated_times.CorrectedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
     assert note.moved([moments], 1e-3).took == 0.0
+    assert note.moved((), 1e-3) == note  # Its time was not fitted: the link at rest under it alone was seen.
     later = annotated_times.shifted(note, loads, 1e-3)
     moved = Filter(mode_coefficients(frequency, ratio, 1e-3))((loads + later([moments]))[:, 1] / -50.0)
     # The step response of an oscillator, from the time of the step on.

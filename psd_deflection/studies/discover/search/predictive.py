@@ -206,6 +206,17 @@ class _Moments:
             t = t - t[:, :a] @ _solved(t[:a, :a], t[:a])
         return t[a:-1, a:-1], t[a:-1, -1], float(max(t[-1, -1], 1e-12 * self.table[-1, -1]))
 
+    def without(self, held: BoolArray, sizes: FloatArray) -> '_Moments':
+        """With the ``held`` columns (a + k,) taken off the target at their ``sizes``, and gone."""
+        t = self.table.copy()
+        given = np.append(np.where(held, -sizes, 0.0), 1.0)
+        t[:, -1] = self.table @ given
+        t[-1] = t[:, -1]
+        t[-1, -1] = given @ self.table @ given
+        gone = np.append(held, False)
+        t[gone], t[:, gone] = 0.0, 0.0
+        return _Moments(t, self.always, self.size)
+
     def with_always(self, sizes: FloatArray) -> FloatArray:
         """Sizes (a + k,) of all, if those of the terms are ``sizes``."""
         a, t = self.always, self.table
@@ -323,11 +334,34 @@ class _Line:
         share = float(np.mean(self.fold != without))
         return _Moments(np.sum(tables_used, axis=0), self.library.always, self.size * share)
 
-    def solved(self, moments: _Moments, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Sizes (p,) of everything, columns being of unit rms, and how likely each takes part."""
-        f, g, energy = moments.beside()
-        sizes, weights = averaged(f, g, energy, max(moments.size - moments.always, 2.0), rng)
-        return moments.with_always(sizes), np.concatenate([np.ones(moments.always), weights])
+    @property
+    def bounds(self) -> FloatArray:
+        """Least and greatest sizes (2, p), columns being of unit rms."""
+        ends = [(p.low - p.off, p.high - p.off) for p in self.library.places]
+        return np.asarray(np.array(ends).T * self.lengths)
+
+    def solved(
+        self, moments: _Moments, rng: np.random.Generator, bounds: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Sizes (p,) of everything, columns being of unit rms, and how likely each takes part.
+
+        A size beyond its bounds is held there, and the others are averaged beside it.
+        """
+        low, high = self.bounds if bounds is None else bounds
+        is_term = np.arange(len(low)) >= moments.always
+        held, sizes, weights = np.zeros(len(low), dtype=bool), np.zeros(len(low)), np.zeros(len(low))
+        while True:
+            beside = moments.without(held, sizes)
+            f, g, energy = beside.beside()
+            of_terms, likely = averaged(f, g, energy, max(moments.size - moments.always, 2.0), rng)
+            free = beside.with_always(of_terms)
+            sizes = np.where(held, sizes, free)
+            weights = np.where(held, weights, np.concatenate([np.ones(moments.always), likely]))
+            beyond = is_term & ~held & ((sizes < low) | (sizes > high))
+            sizes = np.where(beyond, np.clip(sizes, low, high), sizes)
+            if not beyond.any():
+                return sizes, np.where(sizes == 0.0, 0.0, weights)
+            held |= beyond
 
     def refitted(self, moments: _Moments) -> FloatArray:
         """Sizes (p,) of the named model alone."""
@@ -340,7 +374,7 @@ class _Line:
         at = np.append(np.flatnonzero(self.named), len(self.named))
         only = _Moments(moments.table[np.ix_(at, at)], moments.always, moments.size)
         out = np.zeros(len(self.named))
-        out[self.named] = self.solved(only, rng)[0]
+        out[self.named] = self.solved(only, rng, self.bounds[:, self.named])[0]
         return out
 
 
