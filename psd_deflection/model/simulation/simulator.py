@@ -24,9 +24,9 @@ from psd_deflection.rig.wiring import Wiring
 BEFORE_PLATE: tuple[Point, ...] = ('configure', 'load', 'static', 'pose', 'beam')
 """Where an effect acts before the dots fall on the plate."""
 
-PIECE = 5120
-"""Samples of a piece of :meth:`ForwardModel.expect_in_pieces`: an array of three rows of them is less than 128 KB,
-from which an allocator maps pages anew for every array."""
+PIECE = 20_000
+"""Samples of a piece of :meth:`ForwardModel.expect_in_pieces`: shorter ones are more calls, longer ones leave the
+processor's cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
