@@ -98,7 +98,8 @@ def effect_names() -> list[str]:
 
 
 @functools.cache
-def _of_file(path: Path) -> object:
+def _of_file(path: Path, _written_ns: int) -> object:
+    """What the file of an effect holds; read anew once it is written anew."""
     if path.suffix == '.yaml':
         # Imported here: it needs the filters, which a rig without laws does not.
         from psd_deflection.model.simulation.law_files import read_law
@@ -126,7 +127,8 @@ def _of_text(text: str, source: str) -> Effect:
 
 def _load(name: str, place: Place) -> Effect:
     effect = loaded(
-        f'{_words(place)}: holds no effect', lambda: _of_file(place) if isinstance(place, Path) else place.load()
+        f'{_words(place)}: holds no effect',
+        lambda: _of_file(place, place.stat().st_mtime_ns) if isinstance(place, Path) else place.load(),
     )
     if not isinstance(effect, Effect):
         raise ConfigError(f'{_words(place)}: EFFECT = {effect!r}: must be an Effect')

@@ -6,6 +6,7 @@ The effect is the one of docs/simulation.md, "Add an effect", so that the page i
 """
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -60,6 +61,17 @@ def poses(rig: Rig, counts: Counts) -> FloatArray:
     chunk = RawChunk(seq, seq * 1_000_000, counts, np.zeros(n, np.uint8), rig.converter.volts_per_count)
     records = [*pipeline.process(chunk), *pipeline.flush()]
     return np.array([(r.dx, r.dy, r.theta) for r in records if isinstance(r, DeflectionEstimate) and r.primary])
+
+
+def test_a_file_that_is_edited_is_read_anew(folder: Path) -> None:
+    """As in a notebook, without a new process."""
+    file, read = folder / f'{NAME}.py', []
+    for written_ns, words in ((1, 'as it was'), (1, 'as it was'), (2, 'edited')):
+        file.write_text(CODE.replace("summary='", f"summary='{words}: "))
+        os.utime(file, ns=(0, written_ns))
+        read.append(catalogue()[NAME])
+    assert [effect.summary.split(':')[0] for effect in read] == ['as it was', 'as it was', 'edited']
+    assert read[0] is read[1]
 
 
 @pytest.mark.slow

@@ -357,11 +357,11 @@ class _Line:
             free = beside.with_always(of_terms)
             sizes = np.where(held, sizes, free)
             weights = np.where(held, weights, np.concatenate([np.ones(moments.always), likely]))
-            beyond = is_term & ~held & ((sizes < low) | (sizes > high))
-            sizes = np.where(beyond, np.clip(sizes, low, high), sizes)
-            if not beyond.any():
+            outside = is_term & ~held & ((sizes < low) | (sizes > high))
+            sizes = np.where(outside, np.clip(sizes, low, high), sizes)
+            if not outside.any():
                 return sizes, np.where(sizes == 0.0, 0.0, weights)
-            held |= beyond
+            held |= outside
 
     def refitted(self, moments: _Moments) -> FloatArray:
         """Sizes (p,) of the named model alone."""
