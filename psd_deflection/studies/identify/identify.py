@@ -143,7 +143,8 @@ class Identified(StudyResult):
         out = []
         for i, axis in enumerate(self.axes):
             if not axis.modes:
-                out.append(f'{SYMBOLS[i]}: no mode stands out of the noise. Knock on the link, or release a load.')
+                why = axis.why or 'no mode stands out of the noise'
+                out.append(f'{SYMBOLS[i]}: {why}. Knock on the link, or release a load.')
             for mode in axis.modes:
                 frequency, damping, size, how = self.mode_words(i, mode)
                 out.append(f'{SYMBOLS[i]}: {frequency} Hz, damping ratio {damping} (95 %), {size}, from {how}')
@@ -154,8 +155,9 @@ class Identified(StudyResult):
     def page_sentences(self) -> list[str]:
         """How many modes there are; what they are stands in a table."""
         counts = [f'{len(axis.modes)} along {SYMBOLS[i]}' for i, axis in enumerate(self.axes) if axis.modes]
-        first = f'Modes: {", ".join(counts)}.' if counts else 'No mode stands out of the noise.'
-        return [first, *self.withheld_sentences()]
+        first = f'Modes: {", ".join(counts)}.' if counts else 'No mode was found.'
+        whys = [f'{SYMBOLS[i]}: {axis.why}.' for i, axis in enumerate(self.axes) if axis.why]
+        return [first, *whys, *self.withheld_sentences()]
 
     def rows(self) -> list[list[str]]:
         """Return the modes as a table: axis, frequency, damping ratio, amplitude, what from, and the shaper."""

@@ -60,6 +60,10 @@ RESCANS = 3
 TRIMS = 3
 """Times that the ends of the stretches are cut and the modes fitted again."""
 
+MOVES = 20.0
+"""Factor of the noise beyond which all samples together are no noise."""
+DAMPED = 'it moves, but no mode stands out of that: one with a damping ratio above 0.15 shows in four steps of a load'
+
 Modes = list[tuple[float, float]]
 """Frequency, Hz, and damping ratio of each."""
 
@@ -77,7 +81,8 @@ def modes_of(samples: FloatArray, rate: float) -> AxisModes:
             break
         peaks.append(another)
     if not peaks:
-        return AxisModes((), 'none', (), nothing, white)
+        why = DAMPED if np.ptp(filled) > MOVES * white else ''
+        return AxisModes((), 'none', (), nothing, white, why)
     noise = coloured_noise(filled, rate, peaks)
     modes = [(f, 0.01) for f in peaks if exceeds_noise(filled, rate, f, noise)]
     if not modes:
@@ -87,7 +92,10 @@ def modes_of(samples: FloatArray, rate: float) -> AxisModes:
     if stretches:
         return fit_ring_downs(samples, rate, modes, stretches)
     mode = mode_in_operation(filled, rate, modes[0][0])
-    return AxisModes(() if mode is None else (mode,), 'operation' if mode else 'none', (), nothing, white)
+    if mode is None:
+        why = f'it moves most at {modes[0][0]:.3g} Hz, but not as a mode that rings'
+        return AxisModes((), 'none', (), nothing, white, why)
+    return AxisModes((mode,), 'operation', (), nothing, white)
 
 
 def mode_columns(t: FloatArray, modes: Sequence[tuple[float, float]]) -> FloatArray:
@@ -142,7 +150,17 @@ class RingFit(NamedTuple):
     @property
     def bounded(self) -> bool:
         """Whether a damping ratio is at its bound."""
-        return any(not 10.0 * LEAST_DAMPING < z < 0.99 * MOST_DAMPING for _, z in self.modes)
+        return self.bound_words != ''
+
+    @property
+    def bound_words(self) -> str:
+        """What a mode does whose damping ratio is at its bound; '' if none is."""
+        for f, z in self.modes:
+            if z <= 10.0 * LEAST_DAMPING:
+                return f'its motion of {f:.3g} Hz does not decay, as that of a mode does'
+            if z >= 0.99 * MOST_DAMPING:
+                return f'its motion of {f:.3g} Hz decays without ringing (damping ratio of {MOST_DAMPING:g} or more)'
+        return ''
 
 
 def rms_of(values: FloatArray) -> float:
@@ -340,7 +358,7 @@ def fit_ring_downs(samples: FloatArray, rate: float, start: Modes, stretches: li
 
     fitted = np.full(len(samples), np.nan)
     if fit.bounded:
-        return AxisModes((), 'none', (), fitted, fit.deviation)
+        return AxisModes((), 'none', (), fitted, fit.deviation, fit.bound_words)
     sizes = mode_sizes(stretches, fit.modes)
     for stretch in stretches:
         t = np.arange(stretch.last - stretch.first) / np.float64(rate)

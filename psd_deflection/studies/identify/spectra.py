@@ -38,7 +38,8 @@ class AxisModes:
 
     ``how``: fitted to the link ringing alone, or to the spectrum of its motion in operation;
     ``none`` if it does not move. ``stretches``: first and last sample of each. ``fitted`` (n,): the
-    fit, NaN between the stretches. ``noise``: standard deviation of a sample, m or rad.
+    fit, NaN between the stretches. ``noise``: standard deviation of a sample, m or rad. ``why``: why there is none,
+    if not for want of motion.
     """
 
     modes: tuple[Mode, ...]
@@ -46,6 +47,7 @@ class AxisModes:
     stretches: tuple[tuple[int, int], ...]
     fitted: FloatArray = field(repr=False)
     noise: float
+    why: str = ''
 
 
 LOWEST, HIGHEST = 0.5, 200.0

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is said of modes that are given, by hand, and what of them reaches the rig file and the shaper."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -115,6 +116,10 @@ def test_a_mode_in_words() -> None:
     assert lines[1].startswith('ΔX: 40.')
     assert lines[2] == f'ΔX: input shaper {best.name.upper()}: {impulses}'
     assert lines[3] == 'ΔY: no mode stands out of the noise. Knock on the link, or release a load.'
+    y = dataclasses.replace(answer.axes[1], why='it moves')
+    moving = dataclasses.replace(answer, axes=(answer.axes[0], y, answer.axes[2]))
+    assert moving.sentences()[3] == 'ΔY: it moves. Knock on the link, or release a load.'
+    assert moving.page_sentences()[1] == 'ΔY: it moves.'
     assert [line[:2] for line in lines[4:]] == ['θ:', 'θ:']
     rows = answer.rows()
     assert rows[0] == ['ΔX', *words, best.name.upper()]

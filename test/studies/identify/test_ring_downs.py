@@ -531,3 +531,31 @@ def test_a_hundred_samples_are_enough() -> None:
     identified = fitting.modes_of(samples, 100.0)
     assert (identified.how, identified.modes, identified.stretches) == ('none', (), ())
     assert math.isnan(identified.noise)
+
+
+def test_where_no_mode_is_found_the_reason_is_stated() -> None:
+    """Motion is no noise, whatever the damping; a tone is no mode."""
+    rng = np.random.default_rng(4)
+    t = times(8192)
+    error = 1e-6 * rng.normal(size=len(t))
+
+    def stepped(damping: float, steps: int) -> FloatArray:
+        starts = np.arange(steps) * 8.0 / steps
+        parts = (1e-3 * (t >= at) - ring(t - at, damping=damping, phase=0.0) for at in starts)
+        return np.asarray(sum(((-1) ** k * part for k, part in enumerate(parts)), error))
+
+    for damping, steps in ((0.15, 2), (0.2, 4), (0.6, 4)):
+        (mode,) = fitting.modes_of(stepped(damping, steps), SAMPLE_RATE).modes
+        assert [mode.frequency / 16.0, mode.damping / damping] == pytest.approx([1.0, 1.0], abs=2e-3)
+    tone = error + 1e-3 * np.sin(2.0 * math.pi * 16.0 * t)
+    for samples, why in (
+        (error, ''),
+        (stepped(0.2, 2), fitting.DAMPED),
+        (tone, 'its motion of 16 Hz does not decay, as that of a mode does'),
+    ):
+        answer = fitting.modes_of(samples, SAMPLE_RATE)
+        assert (answer.how, answer.modes, answer.why) == ('none', (), why)
+    damped = ring(t[:512], damping=0.9)
+    answer = fitting.fit_ring_downs(damped, SAMPLE_RATE, [(16.0, 0.5)], [stretch(damped)])
+    assert (answer.how, answer.modes) == ('none', ())
+    assert answer.why.endswith(' Hz decays without ringing (damping ratio of 0.7 or more)')
