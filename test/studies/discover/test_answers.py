@@ -30,6 +30,7 @@ from psd_deflection.studies.discover.planning import Discrimination, Plan, Sugge
 from psd_deflection.studies.discover.recorded import Recorded, compared, snapped
 from psd_deflection.studies.discover.report import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
+from psd_deflection.studies.discover.search import workspace as comparing
 from psd_deflection.studies.discover.search.fit import Fit, HeldOut
 from psd_deflection.studies.discover.search.localise import Cell, Dependence, Localisation
 from psd_deflection.studies.discover.search.screen import Candidate, candidates, promising, signature_columns
@@ -171,6 +172,9 @@ def test_a_motion_that_is_asked_for_again_is_kept_and_gives_the_same_bits(monkey
     assert [added(workspace, *given) > 0.0 for given in ((), (early,), ())] == [True, True, False]
     heavier = workspace.loaded(0, 2.0 * observations[0].loads)
     assert [added(heavier), added(workspace)] == [0.5, 0.0]
+    monkeypatch.setattr(comparing, 'MOST_KEPT', sum(len(o.loads) for o in observations) - 1)
+    long = Workspace(observations)
+    assert [added(long), added(long), added(long)] == [1.0, 1.0, 1.0]
 
 
 def test_an_effect_of_one_recording_acts_in_that_alone() -> None:

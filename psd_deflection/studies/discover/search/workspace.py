@@ -42,6 +42,8 @@ class _Asked(NamedTuple):
     effects: list[ActiveEffect]
 
 
+MOST_KEPT = 1_000_000
+"""Samples of all recordings whose motion is kept: 0.12 GB."""
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 
 
@@ -49,7 +51,8 @@ class Motion:
     """Where the dots of a recording fall on the plate, kept once it is asked for twice in a row: the effects of a PSD
     leave it as it is, and most of a simulation's time is spent on it."""
 
-    def __init__(self) -> None:
+    def __init__(self, keeps: bool) -> None:
+        self._keeps = keeps
         self._asked: _Asked | None = None
         self._kept: _Asked | None = None
         self._pieces: list[SimulatedSamples] = []
@@ -63,7 +66,7 @@ class Motion:
         if asked == self._kept and model.in_pieces:
             yield from model.expect_in_pieces(*inputs, self._pieces)
             return
-        keeps = asked == self._asked and model.in_pieces
+        keeps = self._keeps and asked == self._asked and model.in_pieces
         self._asked = asked
         if keeps:
             self._kept, self._pieces = None, []
@@ -90,7 +93,8 @@ class Workspace(Comparison):
         self.physics = Physics.of(observations[0].rig)
         self.tally = SimulationCount()
         self.base = tuple(base)
-        self._motions = [Motion() for _ in observations]
+        keeps = sum(len(o.loads) for o in observations) <= MOST_KEPT
+        self._motions = [Motion(keeps) for _ in observations]
         self.fine: list[int] = []
         self.measured: list[FloatArray] = []
         self.count: list[FloatArray] = []
