@@ -47,7 +47,7 @@ MOST_KEPT = 1_000_000
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 
 
-class Motion:
+class KeptMotion:
     """Where the dots of a recording fall on the plate, kept once it is asked for twice in a row: the effects of a PSD
     leave it as it is, and most of a simulation's time is spent on it."""
 
@@ -94,7 +94,7 @@ class Workspace(Comparison):
         self.tally = SimulationCount()
         self.base = tuple(base)
         keeps = sum(len(o.loads) for o in observations) <= MOST_KEPT
-        self._motions = [Motion(keeps) for _ in observations]
+        self._motions = [KeptMotion(keeps) for _ in observations]
         self.fine: list[int] = []
         self.measured: list[FloatArray] = []
         self.count: list[FloatArray] = []
