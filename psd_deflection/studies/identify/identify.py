@@ -211,6 +211,7 @@ class Identified(StudyResult):
         return {
             'unit': UNITS[i],
             'how': axis.how,
+            'why': axis.why,
             'noise': axis.noise,
             'stretches': [[a / self.rate, b / self.rate] for a, b in axis.stretches],
             'modes': [

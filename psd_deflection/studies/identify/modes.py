@@ -62,7 +62,7 @@ TRIMS = 3
 
 MOVES = 20.0
 """Factor of the noise beyond which all samples together are no noise."""
-DAMPED = 'it moves, but no mode stands out of that: one with a damping ratio above 0.15 shows in four steps of a load'
+DAMPED = 'it moves, but no mode stands out of that, as where the damping ratio is above 0.15'
 
 Modes = list[tuple[float, float]]
 """Frequency, Hz, and damping ratio of each."""

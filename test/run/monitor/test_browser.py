@@ -340,6 +340,9 @@ def test_a_load_is_noted_since_the_last_step_and_takes_a_decimal_comma(
     page.driver.find_element(By.ID, 'load').click()
     page.until('document.getElementById("weigh").open && document.getElementById("since_step").hidden')
     assert page.js('document.getElementById("ago").value') == '0'
+    page.driver.find_element(By.ID, 'weigh_cancel').click()
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("weigh").open')
     fields = [page.driver.find_element(By.ID, name) for name in ('fx', 'fy')]
     # Three digits may be thousands; the browser keeps the dialog open and names the field.
     for typed in ('1,500', '1.000,5', '1e-', ''):
@@ -349,8 +352,9 @@ def test_a_load_is_noted_since_the_last_step_and_takes_a_decimal_comma(
     for field, typed in zip(fields, (' +.5', '-1,5'), strict=True):
         field.clear()
         field.send_keys(typed)
+    page.driver.execute_script('document.getElementById("notice").textContent = ""')
     page.driver.find_element(By.CSS_SELECTOR, '#weigh button[value=set]').click()
-    page.until('!document.getElementById("weigh").open')
+    page.until('document.getElementById("notice").textContent === "load noted"')
     assert serving.shown.loads[1:] == [(0.5, -1.5, 0.0, False)]
     assert page.complaints() == []
 

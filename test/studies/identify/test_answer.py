@@ -120,6 +120,7 @@ def test_a_mode_in_words() -> None:
     moving = dataclasses.replace(answer, axes=(answer.axes[0], y, answer.axes[2]))
     assert moving.sentences()[3] == 'ΔY: it moves. Knock on the link, or release a load.'
     assert moving.page_sentences()[1] == 'ΔY: it moves.'
+    assert [moving.tree()['axes'][name]['why'] for name in ('dx', 'dy')] == ['', 'it moves']
     assert [line[:2] for line in lines[4:]] == ['θ:', 'θ:']
     rows = answer.rows()
     assert rows[0] == ['ΔX', *words, best.name.upper()]

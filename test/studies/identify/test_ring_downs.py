@@ -539,18 +539,15 @@ def test_where_no_mode_is_found_the_reason_is_stated() -> None:
     t = times(8192)
     error = 1e-6 * rng.normal(size=len(t))
 
-    def stepped(damping: float, steps: int) -> FloatArray:
-        starts = np.arange(steps) * 8.0 / steps
-        parts = (1e-3 * (t >= at) - ring(t - at, damping=damping, phase=0.0) for at in starts)
-        return np.asarray(sum(((-1) ** k * part for k, part in enumerate(parts)), error))
+    def released(damping: float) -> FloatArray:
+        return error + sum(ring(t - at, damping=damping, phase=0.0) - 1e-3 * (t >= at) for at in (0.0, 4.0))
 
-    for damping, steps in ((0.15, 2), (0.2, 4), (0.6, 4)):
-        (mode,) = fitting.modes_of(stepped(damping, steps), SAMPLE_RATE).modes
-        assert [mode.frequency / 16.0, mode.damping / damping] == pytest.approx([1.0, 1.0], abs=2e-3)
+    (mode,) = fitting.modes_of(released(0.15), SAMPLE_RATE).modes
+    assert [mode.frequency / 16.0, mode.damping / 0.15] == pytest.approx([1.0, 1.0], abs=2e-3)
     tone = error + 1e-3 * np.sin(2.0 * math.pi * 16.0 * t)
     for samples, why in (
         (error, ''),
-        (stepped(0.2, 2), fitting.DAMPED),
+        (released(0.2), fitting.DAMPED),
         (tone, 'its motion of 16 Hz does not decay, as that of a mode does'),
     ):
         answer = fitting.modes_of(samples, SAMPLE_RATE)
