@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from blind.campaign import bound_line, conclude, options, over
-from blind.duels import BoolArray, forward_backward, linear, rms, stlsq
+from blind.duels import forward_backward, linear, rms, stlsq
 from psd_deflection.model.simulation.declaration import EffectParameter
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BoolArray, FloatArray
 from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
 from blind.campaign import options
 from blind.machines import PHYSICAL, AuxTel, Boom, Emps, TwoLinkArm
 from psd_deflection.model.simulation.declaration import Effect
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BoolArray, FloatArray
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.plants import Model, Plant
 from psd_deflection.studies.discover.trees import size_of
@@ -25,7 +24,6 @@ GROUPS = 11  # Folds into which the parts of a plant are dealt in turn, at most.
 THRESHOLDS = np.geomspace(1e-2, 1.0, 25)  # Of STLSQ, in units of the largest contribution of a term.
 RIDGE = 1e-4  # Of STLSQ, in units of the mean square of a term.
 FRICTION = ('coulomb_friction', 'force_offset')
-BoolArray = npt.NDArray[np.bool_]
 Residual = Callable[[Sequence[Effect], BoolArray], FloatArray]
 """What effects leave of all values if their sizes are fitted to some of them."""
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 Counts = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
 MOST_PSDS = 6

@@ -7,9 +7,8 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from psd_deflection.records import BlockStatus, FloatArray, Record, SpotMeans
+from psd_deflection.records import BlockStatus, BoolArray, FloatArray, Record, SpotMeans
 from psd_deflection.rig.config import Rig
 
 PERIODS = 4
@@ -20,8 +19,6 @@ LEAST_SHARE = 0.03
 """A step is at least this share of the largest."""
 REACH_S = 60.0
 """A step that is older is not looked for."""
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,11 +25,10 @@ from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.model.plate.layout import Geometry
 from psd_deflection.model.plate.plate import Number, Tilts
 from psd_deflection.model.solvers.plane import Covariance, checked_variances
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BoolArray, FloatArray
 from psd_deflection.rig.config import Rig
 
 Columns = FloatArray | float
-BoolArray = npt.NDArray[np.bool_]
 
 _STEP = 1e-8
 """m. Of differences: far above rounding, far below what bends the answer."""

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csc_array
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.observation import Observation
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BoolArray, FloatArray
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.shared_findings import note_finding
 from psd_deflection.studies.discover.hidden import Direction, LoadDirection
@@ -26,8 +25,6 @@ from psd_deflection.studies.loads.effective import SwayingLoad, swaying
 from psd_deflection.studies.loads.holds import Hold, ImpliedLoads, WrongNote, find_holds, implied_loads
 
 RINGING = 'ringing after what is left out'
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 def times(o: Observation, recording: int) -> list[Hold]:

@@ -10,14 +10,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.recordings.observation import Observation
-from psd_deflection.records import FloatArray, channel_names, dot_channels
+from psd_deflection.records import BoolArray, FloatArray, channel_names, dot_channels
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.search.proposals import coarse_step
@@ -26,8 +25,6 @@ from psd_deflection.studies.loads.annotated_times import CorrectedLoads, correct
 from psd_deflection.studies.loads.thresholds import OUTLIER_SD, SLIGHT
 
 _TO_SD = 1.4826
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 def outliers(residual: FloatArray, least: float) -> BoolArray:

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.fft import dct, idct
 from scipy.linalg import solve_toeplitz
 from scipy.ndimage import median_filter
 from scipy.signal import detrend, lfilter
 
 from psd_deflection.recordings.observation import Observation
-from psd_deflection.records import FloatArray, dot_channels
+from psd_deflection.records import BoolArray, FloatArray, dot_channels
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.thresholds import BANDS, CERTAIN_SD, CORNERS, LEAST_REST, ORDER, SIGNIFICANT
 from psd_deflection.studies.loads.thresholds import AS_GOOD, DISTINCT_SD, MANYFOLD, PART, SAME
@@ -96,9 +95,6 @@ def block_factor(seconds: float, block: float, corners: FloatArray) -> FloatArra
     as many octaves as their ratio has, each with the same slow noise.
     """
     return np.asarray(1.0 + 2.0 * block * corners * np.log(max(seconds / block, 1.0)))
-
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,11 +23,10 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.recordings.read.references import TIMES, ReadingsTable, references_in
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.records import FloatArray, IntArray, dot_names
+from psd_deflection.records import BoolArray, FloatArray, IntArray, dot_names
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.conclusion import model_yaml
 from psd_deflection.studies.discover.noise import settling
-from psd_deflection.studies.discover.search.fit import BoolArray
 from psd_deflection.studies.discover.thresholds import CERTAIN_SD, FEWEST_CASES, FOLDS, HALF
 from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.loads.thresholds import FEWEST_LOADS, SEVERAL

@@ -10,12 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psd_deflection.measure.steps import LEAST_SHARE, PERIODS, DotStep, lasting_steps
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.plate.linear import design_matrix
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import BoolArray, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.steps import applied, link_modes, link_motion, time_of_step
 from psd_deflection.studies.loads.thresholds import (
@@ -80,9 +79,6 @@ def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoa
         sd = np.sqrt((centred**2).mean(axis=0) / (b - a))
         measured.append(MeasuredLoad(int(at[a]), int(last), sd))
     return out, tuple(measured)
-
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BoolArray, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.annotated_times import ordinal, unannotated_steps
 from psd_deflection.studies.loads.plate_motion import across_plate, dot_rows, fine_means, moved_plate
@@ -31,7 +31,6 @@ from psd_deflection.studies.loads.thresholds import (
     TOLERANCE,
 )
 
-BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]
 
 AXES = np.array([1.0, 1.0, 0.1])

@@ -22,7 +22,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.plants import EffectParameter, Model, Plant, plant_effect
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plant_search import PlantComparison, PlantDiscovery
-from psd_deflection.studies.discover.search import predictive
+from psd_deflection.studies.discover.search import predictive, subsets
 from psd_deflection.studies.discover.search import smooth as smoothing
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.screen import Screen
@@ -315,7 +315,7 @@ def all_subsets(f: FloatArray, g: FloatArray, energy: float, size: float) -> tup
     rows = []
     for inside in itertools.product((False, True), repeat=count):
         n, at = sum(inside), np.flatnonzero(inside)
-        for slab in predictive.SLABS:
+        for slab in subsets.SLABS:
             room = f[np.ix_(at, at)] + slab * np.eye(n)
             mean = np.linalg.solve(room, g[at])
             log = 0.5 * (n * np.log(slab) - np.linalg.slogdet(room)[1]) - np.log(math.comb(count, n))
@@ -330,24 +330,24 @@ def all_subsets(f: FloatArray, g: FloatArray, energy: float, size: float) -> tup
     return sizes / total, weights / total
 
 
-@pytest.mark.parametrize(('slabs', 'atol'), [(predictive.SLABS, 0.06), (np.array([1.0]), 0.02)])
+@pytest.mark.parametrize(('slabs', 'atol'), [(subsets.SLABS, 0.06), (np.array([1.0]), 0.02)])
 def test_averages_are_those_over_all_subsets(slabs: FloatArray, atol: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predictive, 'WALK', (1000, 8, 1000))
-    monkeypatch.setattr(predictive, 'SLABS', slabs)
+    monkeypatch.setattr(subsets, 'WALK', (1000, 8, 1000))
+    monkeypatch.setattr(subsets, 'SLABS', slabs)
     rng = np.random.default_rng(3)
     x = rng.standard_normal((80, 4))
     x[:, 1] += 0.8 * x[:, 0]
     y = 0.4 * x[:, 0] + 0.25 * x[:, 2] + 0.9 * rng.standard_normal(80)
     given = (x.T @ x, x.T @ y, float(y @ y), 80.0)
-    sizes, weights = predictive.averaged(*given, rng)
+    sizes, weights = subsets.averaged(*given, rng)
     want, likely = all_subsets(*given)
     np.testing.assert_allclose(weights, likely, atol=atol)
     np.testing.assert_allclose(sizes, want, atol=0.3 * atol)
     # What is explained already, and nothing to explain.
     f = np.diag([80.0, 80.0 * 1e-7])
-    sizes, weights = predictive.averaged(f, np.array([40.0, 1e-9]), 80.0, 80.0, rng)
+    sizes, weights = subsets.averaged(f, np.array([40.0, 1e-9]), 80.0, 80.0, rng)
     assert sizes == pytest.approx([40.0 / 81.0, 0.0], rel=0.05, abs=1e-6)
-    for nothing in (predictive.averaged(1e-7 * f, f[0], 80.0, 80.0, rng), predictive.averaged(f, f[0], 0.0, 80.0, rng)):
+    for nothing in (subsets.averaged(1e-7 * f, f[0], 80.0, 80.0, rng), subsets.averaged(f, f[0], 0.0, 80.0, rng)):
         np.testing.assert_array_equal(nothing, np.zeros((2, 2)))
 
 

@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
-from psd_deflection.records import FloatArray
+from psd_deflection.records import BoolArray, FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.thresholds import ROUNDING, STEP, STOP
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

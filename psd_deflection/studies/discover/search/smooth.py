@@ -12,11 +12,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky
 from scipy.optimize import Bounds, minimize
 
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import BoolArray, FloatArray, IntArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, heldout_gap, unseen_gap
 from psd_deflection.studies.discover.search.localise import Localisation
@@ -32,7 +31,6 @@ from psd_deflection.studies.discover.thresholds import (
 )
 from psd_deflection.studies.loads.thresholds import FEWEST_VALUES
 
-BoolArray = npt.NDArray[np.bool_]
 Variables = Mapping[str, Sequence[FloatArray]]
 """By name, for each case (n,) or, of several coordinates, (n, k)."""
 
